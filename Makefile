@@ -81,7 +81,7 @@ smoke-all: $(STAMP)
 fuzz: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.reliability fuzz
 
-# Runs that last, with kills and full disks: an hour; the part "disks" needs root.
+# Long runs, with kills and full disks: an hour; the part "disks" needs root.
 soak: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.reliability soak
 

@@ -1,11 +1,11 @@
-"""Append a filter to a dm_control arm: reacher's hidden joint velocities from noisy joint positions.
+"""Append a filter to a dm_control arm: reacher's joint velocities from noisy joint positions.
 
     python examples/append_to_env.py
 
-The encoders of the arm are made noisy (0.05 rad); the velocities are hidden from the filter. The dynamics are
+The encoders of the arm have noise (0.05 rad); the filter does not observe the velocities. The dynamics are
 learned, with the action, from a few rollouts; then one line appends the filter to the environment, and a policy could
-read ``("belief", "mean")``. Needs no rendering and no GL library.
-The true states are recorded here: docs/how_to/train_motion_first.md says how to train the motion from them first.
+read ``("belief", "mean")``. The example needs no rendering and no GL library.
+The true states are recorded here: docs/how_to/train_motion_first.md shows how to train the motion on them first.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ NOISE, DT = ENCODER_STD, 0.02  # encoder noise, 0.05 rad; control step in s
 
 
 def make_filter(states: torch.Tensor) -> DEnKF:
-    """State [q1, q2, w1, w2] in rad and rad/s; learned dynamics, known observation of the positions."""
+    """Returns a filter of [q1, q2, w1, w2] in rad and rad/s; learned dynamics, known observation of the positions."""
     loc, scale = states.mean(0), states.std(0)
     return DEnKF(
         transition=LearnedTransition(
             StochasticMLP(4 + 2, 4, (64, 64), output_gain=0.1), loc=loc, scale=scale, action_key="action"
         ),
-        sensor=None,  # the encoders are read as they are
+        sensor=None,  # the encoders are read directly
         observation=Select([0, 1]),
         noise=ConstantNoise([NOISE, NOISE], in_key="encoder"),
         analysis=EnsembleAnalysis(
             "etkf", observation_key="encoder"
-        ),  # draws no noise for a reading that is used as it is
+        ),  # deterministic: draws no perturbations of the reading
         initial=FromSensor([0, 1], mean=[0.0] * 4, std=[1.0, 1.0, 0.5, 0.5], observation_key="encoder"),
     )
 
@@ -65,7 +65,7 @@ def train(denkf: DEnKF, rollouts: TensorDict, updates: int, length: int) -> None
 
 
 def compare(rollout: TensorDict) -> str:
-    """The filter's velocities against differences of the encoders, raw and smoothed over eleven steps."""
+    """Compares the filter's velocities with differences of the encoders, raw and smoothed over eleven steps."""
     truth, encoder = rollout["next", "state"], rollout["next", "encoder"]
     raw = encoder.diff(dim=0, prepend=encoder[:1]) / DT
     smooth = torch.stack([raw[max(0, t - 10) : t + 1].mean(0) for t in range(len(raw))])
@@ -83,7 +83,7 @@ def compare(rollout: TensorDict) -> str:
 
 
 def draw(rollout: TensorDict, file: Path) -> None:
-    """Draws the joint velocities over time, beside differences of the encoders."""
+    """Draws the joint velocities over time, next to differences of the encoders."""
     seen = rollout["next"]
     differences = seen["encoder"].diff(dim=0, prepend=seen["encoder"][:1]) / DT
     names, dots = ["joint 1, rad/s", "joint 2, rad/s"], {dim: differences[:, dim - 2] for dim in (2, 3)}

@@ -1,11 +1,11 @@
-"""Compose a filter of your own: a motion model in ten lines, two sensors, one analysis after the other.
+"""Compose a custom filter: a motion model in ten lines, two sensors, one analysis after the other.
 
     python examples/custom_filter.py
 
 A boat drifts on a lake. A GPS gives its position (1 m noise, but only one step in ten); three beacons give strongly
-distorted ranges at every step, which a learned sensor turns into a position. The motion model is ours: constant
-velocity, pushed by gusts whose strength is learned. The first analysis takes the beacons, the second the GPS; each has
-its own mask. Any ``TensorDictModule`` with the right keys could take the place of any part.
+distorted ranges at every step, which a learned sensor maps to a position. The motion model is defined here: constant
+velocity, with gusts whose strength is learned. The first analysis reads the beacons, the second the GPS; each has
+its own mask. Any ``TensorDictModule`` with the right keys can replace any part.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ BEACONS = torch.tensor([[30.0, 0.0], [-20.0, 25.0], [-20.0, -25.0]])  # m
 
 
 class GustyDrift(Transition):
-    """Our motion model: position moves with the velocity, gusts N(0, gust^2) change the velocity."""
+    """The motion model: position moves with the velocity, gusts N(0, gust^2) change the velocity."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])
@@ -49,7 +49,7 @@ class GustyDrift(Transition):
 
 
 class Beacons(Transform):
-    """The world's side of the beacons: saturating, noisy ranges ``"ranges"`` [*B, 3] of the true state."""
+    """Simulates the beacons: saturating, noisy ranges ``"ranges"`` [*B, 3] of the true state."""
 
     def __init__(self):
         super().__init__(in_keys=["state"], out_keys=["ranges"])
@@ -67,7 +67,7 @@ class Beacons(Transform):
 
 
 def make_env(boats: int, seed: int) -> TransformedEnv:
-    """The lake: constant velocity with a little drag and gusts of 0.3 m/s."""
+    """Returns boats on the lake: constant velocity with a little drag and gusts of 0.3 m/s."""
     drift = torch.eye(4) + DT * torch.tensor([[0, 0, 1, 0], [0, 0, 0, 1], [-0.01, 0, -0.1, 0], [0, -0.01, 0, -0.1]])
     env = LinearGaussianEnv(
         drift, torch.eye(2, 4), [0.0, 0.0, 0.3, 0.3], [1.0, 1.0], initial_std=[5.0, 5.0, 1.0, 1.0],
@@ -78,7 +78,7 @@ def make_env(boats: int, seed: int) -> TransformedEnv:
 
 
 def make_filter(use_beacons: bool) -> Filter:
-    """Motion, the analysis of the beacons, then that of the GPS on what the beacons left."""
+    """Returns a filter of the motion, the analysis of the beacons, and the analysis of the GPS on its result."""
     beacons = [
         VectorSensor(3, 2, ensemble_size=ENSEMBLE, scale=[10.0, 10.0], in_key="ranges"),
         DiagonalNoise(2, r=3.0, scale=[10.0, 10.0]),
@@ -103,7 +103,7 @@ def make_filter(use_beacons: bool) -> Filter:
 
 
 def train(model: Filter, data: TensorDict, updates: int, length: int, sensor: float) -> None:
-    """Fits whatever the filter has to learn, through ``length`` steps from the start of a run."""
+    """Fits all parameters of the filter, through ``length`` steps from the start of a run."""
     loss = DEnKFLoss(model, sensor=sensor, transition=0.0, state_scale=[5.0, 5.0, 1.0, 1.0])
     optimiser = torch.optim.Adam(model.parameters(), lr=5e-3)
     for _ in (bar := tqdm(range(updates), desc="training", disable=None)):

@@ -3,9 +3,9 @@
     python examples/deploy.py
     python examples/deploy.py --onnx    # an ONNX model, which onnxruntime runs, from C++ as well
 
-The filter tells the angles and the speeds of two joints from their encoders (12 bits a turn, and noise); differences of
-such encoders over a millisecond are useless. First this process exports the step. Then another process, which imports
-torch alone, reads the file and runs it every millisecond on simulated encoders.
+The filter estimates the angles and the speeds of two joints from their encoders (12 bits per turn, and noise);
+differences of such encoders over a millisecond are useless. First this process exports the step. Then another process,
+which imports only torch, reads the file and runs it every millisecond on simulated encoders.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Coasting(nn.Module):
     """Changes of [angle, speed, acceleration] of two joints in a millisecond."""
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
-        """From and to ``[*, E, 6]``: angles, speeds, accelerations."""
+        """Returns the changes ``[*, E, 6]`` of states ``[*, E, 6]``: angles, speeds, accelerations."""
         speed, acceleration = state[..., 2:4], state[..., 4:]
         still = torch.zeros_like(acceleration)
         return torch.cat([DT * speed + DT**2 / 2 * acceleration, DT * acceleration, still], -1)
 
 
 def export(path: Path, compiled: bool) -> float:
-    """Writes the file; returns the milliseconds that the same step takes here, eagerly."""
+    """Writes the file; returns the milliseconds of the same step in this process, eagerly."""
     from tensordict import TensorDict
 
     from torch_denkf import DEnKF, export_step
@@ -52,7 +52,7 @@ def export(path: Path, compiled: bool) -> float:
         Select,
     )
 
-    # The accelerations walk at random.
+    # The accelerations are random walks.
     walk = ConstantNoise(
         [0.03 * JERK * math.sqrt(DT)] * 2, in_key=("belief", "ensemble"), out_key=("forecast", "noise")
     )
@@ -77,19 +77,19 @@ def export(path: Path, compiled: bool) -> float:
 
 
 def joints(now: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """True angles and speeds ``[2]`` at a time in s."""
+    """Returns true angles and speeds ``[2]`` at a time in s."""
     amplitude, frequency, phase = (torch.tensor(value) for value in TRUTH)
     angle, rate = 2 * math.pi * frequency * now + phase, 2 * math.pi * frequency
     return amplitude * angle.sin(), amplitude * rate * angle.cos()
 
 
 def draw(shapes: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
-    """Standard normal numbers."""
+    """Returns standard normal draws of some shapes, by name."""
     return {name: torch.randn(shape) for name, shape in shapes.items()}
 
 
 def run(path: Path, seconds: float) -> None:
-    """Returns what runs on the robot: a step every millisecond, as far as this computer keeps time."""
+    """Runs the robot's loop: a step every millisecond, if this computer is fast enough."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     step, count = load_step(path), int(seconds / DT)
@@ -97,7 +97,7 @@ def run(path: Path, seconds: float) -> None:
     readings = [((angle + NOISE * torch.randn(2)) / COUNT).round() * COUNT for angle, _ in frames]
     spread = torch.tensor([0.01, 0.01, 5.0, 5.0, 50.0, 50.0])
     state = {"belief.ensemble": torch.cat([readings[0], torch.zeros(4)]) + spread * torch.randn(MEMBERS, 6)}
-    # An ONNX model draws nothing itself.
+    # An ONNX model draws no random numbers; its inputs include the noise.
     noises = {name: shape for name, (shape, _) in step.inputs.items() if name.startswith("noise.")}
     means, latencies, late = [], [], 0
     with torch.inference_mode():
@@ -137,7 +137,7 @@ def run(path: Path, seconds: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="where to leave the file; a temporary folder by default")
+    parser.add_argument("--out", type=Path, help="the file to write; by default in a temporary folder")
     parser.add_argument("--onnx", action="store_true", help="write an ONNX model; needs torch_denkf[onnx]")
     parser.add_argument("--seconds", type=float, default=5.0, help="to run at 1 kHz")
     parser.add_argument("--not-compiled", action="store_true", help="write the graph alone: needs no C++ compiler")

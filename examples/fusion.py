@@ -2,9 +2,9 @@
 
     python examples/fusion.py
 
-The wheel reads the speed 50 times a second, the laser the position ten times a second, and the GPS the position once a
-second, 0.3 s late. The program compares every set of sensors, heeds and ignores the delay, filters steps of irregular
-length, and learns when not to believe the laser. No data set. It takes a minute. The page behind this one is
+The wheel reads the speed at 50 Hz, the laser the position at 10 Hz, and the GPS the position at 1 Hz with a latency of
+0.3 s. The program compares every set of sensors, uses and ignores the delay, filters steps of irregular
+length, and learns when to ignore the laser. No data set. It takes a minute. The page behind this one is
 ``docs/how_to/several_sensors.md``; measured errors on a robot's arm and on a car are in ``docs/results/fusion.md``.
 """
 
@@ -23,7 +23,7 @@ from torch_denkf.modules import LinearTransition, MomentPrior, Select
 from torch_denkf.motions import ContinuousMotion, ContinuousNoise
 
 DT, LATE = 0.02, 15  # s; steps by which the GPS is late
-PUSH = 1.0  # m/s for each root of a second: how much the speed wanders
+PUSH = 1.0  # m/s per root second: random walk of the speed
 NOISE = {"wheel": 0.3, "laser": 0.05, "gps": 0.5}  # m/s, m, m
 EVERY = {"wheel": 1, "laser": 5, "gps": 50}  # steps between readings
 WHAT = {"wheel": 1, "laser": 0, "gps": 0}  # of [position m, speed m/s]
@@ -32,7 +32,7 @@ WANDER = torch.diag(torch.tensor([0.0, PUSH**2]))
 
 
 def record(carts: int, steps: int, *, failing: bool = False) -> TensorDict:
-    """True states, readings when they arrive, and masks; with ``failing`` somebody walks through the laser's beam."""
+    """Returns true states, readings at their arrival, and masks; ``failing`` adds people in the laser's beam."""
     speed = (PUSH * DT**0.5 * torch.randn(carts, steps)).cumsum(1)
     state = torch.stack([DT * speed.cumsum(1), speed], -1)
     data = TensorDict({"state": state}, [carts, steps])
@@ -43,14 +43,14 @@ def record(carts: int, steps: int, *, failing: bool = False) -> TensorDict:
     begin = torch.randint(steps // 4, steps // 2, (carts, 1))
     data["blocked"] = failing & (time >= begin) & (time < begin + steps // 4)
     data["laser"] = torch.where(data["blocked"].unsqueeze(-1), data["laser"] - 2.0, data["laser"])
-    for key in ("gps", "gps_observed"):  # what arrives now was read LATE steps ago
+    for key in ("gps", "gps_observed"):  # a reading that arrives now was taken LATE steps ago
         data[key] = data[key].roll(LATE, 1)
         data[key][:, :LATE] = False
     return data
 
 
 def make(*, delay: int = LATE, joint: bool = False, weights: nn.Module | None = None) -> FusedFilter:
-    """The filter: a Kalman filter, because motion and readings are linear."""
+    """Returns the filter: a Kalman filter, because motion and readings are linear."""
     delays = {"wheel": 0, "laser": 0, "gps": delay}
     return FusedFilter(
         LinearTransition(MOVE, DT * WANDER),
@@ -62,13 +62,13 @@ def make(*, delay: int = LATE, joint: bool = False, weights: nn.Module | None = 
 
 
 def error(out: TensorDict, rows=...) -> float:
-    """Root mean square error of the position in m."""
+    """Returns the root mean square error of the position in m."""
     return (out["belief", "mean"] - out["state"])[..., 0][rows].square().mean().sqrt().item()
 
 
 @torch.no_grad()
 def run(filter: FusedFilter, data: TensorDict, *lacking: str) -> TensorDict:
-    """Filters the recordings without some sensors: a mask that is False everywhere switches one off."""
+    """Filters the recordings without some sensors, whose observed masks are set to False."""
     data = data.copy()
     for name in lacking:
         data[f"{name}_observed"] = torch.zeros_like(data[f"{name}_observed"])
@@ -92,9 +92,9 @@ def main() -> None:
     one, both = run(fused, data), run(make(joint=True), data)
     print(f"  one after the other and joint differ by {(one['belief'] - both['belief'])['mean'].abs().max():.0e} m")
 
-    print("\nWheel and GPS, whose readings are 0.3 s old when they come:")
-    print(f"  taken for new ones   {error(run(make(delay=0), data, 'laser')):.3f}")
-    print(f"  put where they belong {error(run(fused, data, 'laser')):.3f}")
+    print("\nWheel and GPS, whose readings have a latency of 0.3 s:")
+    print(f"  latency ignored      {error(run(make(delay=0), data, 'laser')):.3f}")
+    print(f"  latency modelled      {error(run(fused, data, 'laser')):.3f}")
 
     # Steps of irregular length: the motion and its noise follow from the seconds since the last step.
     motion = ContinuousMotion(RATE)
@@ -110,11 +110,11 @@ def main() -> None:
     some = data[:, times].copy()
     seconds = DT * torch.diff(times, prepend=times[:1])
     some["dt"] = seconds.reshape(1, -1, 1).expand(carts, -1, 1)
-    print(f"\nOnly every third step or so is there, {seconds[1:].min():.2f} to {seconds.max():.2f} s apart:")
+    print(f"\nIrregular steps, {seconds[1:].min():.2f} to {seconds.max():.2f} s apart:")
     print(f"  {error(run(irregular, some)):.3f}")
 
-    # The laser reads two metres too little while somebody is in its beam, and nobody says so. The weights learn from
-    # the score of the belief, and see nothing but innovations.
+    # The laser reads two metres too little while a person is in its beam, without a mask. The weights are trained by
+    # the score of the belief; their inputs are the innovations.
     weights = SensorAttention(dict.fromkeys(NOISE, 1))
     learning = make(delay=0, weights=weights)
     loss = GaussianLoss(learning, transition=0.0, sensor=0.0)
@@ -130,7 +130,7 @@ def main() -> None:
     blocked = failing["blocked"]
     print("\nThe laser fails for a while; error of the position then, m:")
     weighted = run(make(weights=weights), failing)
-    print(f"  believed             {error(run(fused, failing), blocked):.3f}")
+    print(f"  no weights           {error(run(fused, failing), blocked):.3f}")
     print(f"  learned weights      {error(weighted, blocked):.3f}")
     print(f"  never had a laser    {error(run(fused, failing, 'laser'), blocked):.3f}")
     seen = failing["laser_observed"].squeeze(-1)

@@ -1,11 +1,11 @@
 """From a data set to a belief on one page: a car's motion from its camera, on drives in KITTI's layout.
 
-    python examples/kitti.py                                                   # drives that are rendered here
+    python examples/kitti.py                                                   # renders the drives first
     python examples/kitti.py --root KITTI --train 00 02 05 08 --test 09        # KITTI's odometry benchmark
 
-A data set, a filter, its training, a replay environment with the filter in it, errors, a picture: each is a few lines
-of ``main``. ``examples/ur5.py``, ``lerobot.py`` and ``own_recordings.py`` are the same page for other robots. The study
-behind the tables, with every filter and disturbance, is ``python -m benchmarks.kitti``.
+A data set, a filter, its training, a replay environment with the filter in it, errors, a plot: each is a few lines
+of ``main``. ``examples/ur5.py``, ``lerobot.py`` and ``own_recordings.py`` are the same page for other robots. The full
+study, with every filter and disturbance, is ``python -m benchmarks.kitti``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ VELOCITIES = [3, 4]  # v in m/s and theta_dot in rad/s, of the state [x, y, thet
 
 
 def make_filter(data: KITTIOdometryExperienceReplay) -> DEnKF:
-    """Known motion of the pose, learned change of the velocities, and a sensor that reads them from optical flow."""
+    """Returns the filter: known motion of the pose, learned change of the velocities, read from optical flow."""
     dt = float(data[0]["dt"])
     loc, scale = data.statistics["velocity", "mean"], data.statistics["velocity", "std"]
     return DEnKF(
@@ -48,18 +48,18 @@ def make_filter(data: KITTIOdometryExperienceReplay) -> DEnKF:
         # Innovations correct the velocities, and each member's pose moves with them.
         analysis=TensorDictSequential(EnsembleAnalysis("sensor", belief_prefix="analysis"), UnicycleMotion(dt)),
         initial=AroundState([0.0, 0.0, 0.0, *(0.2 * scale).tolist()], ensemble_size=32),  # around the true start
-        process_noise=[0.0, 0.0, 0.0, *(0.1 * scale).tolist()],  # how much the velocities may change in a step
+        process_noise=[0.0, 0.0, 0.0, *(0.1 * scale).tolist()],  # random change of the velocities in a step
     )
 
 
 def train(denkf: DEnKF, data: KITTIOdometryExperienceReplay, out: Path, updates: tuple[int, int]) -> None:
-    """The sensor alone, then all of the filter through 16 steps; resumes where it was broken off."""
+    """Trains the sensor alone, then the whole filter through 16 steps; resumes after an interruption."""
     scale = data.statistics["velocity", "std"]
     of_sensor = SensorLoss(denkf, observation_scale=scale)
-    # The pose follows from the velocities: errors of an infinite scale do not count. nll moves the noise model.
+    # The pose follows from the velocities: an infinite scale removes its errors. nll trains the noise model.
     of_filter = DEnKFLoss(denkf, state_scale=[float("inf")] * 3 + scale.tolist(), observation_scale=scale, nll=0.02)
     stages = [
-        Stage("sensor", of_sensor, data.draw, updates[0], lengths={0: 1}),  # 160 rows on their own, see main
+        Stage("sensor", of_sensor, data.draw, updates[0], lengths={0: 1}),  # single rows, 160 in a batch, see main
         Stage("filter", of_filter, data.draw, updates[1], lr=1e-3, lengths={0: 8, updates[1] // 2: 16}),
     ]
     FilterTrainer(denkf, stages, out=out, device="cpu", keep="last").fit()
@@ -83,7 +83,7 @@ def main() -> None:
         args.root = args.out / "drives"
         write_drives(args.root, [*args.train, *args.test], frames=20 if args.smoke else 150, size=size)
 
-    # The data set: optical flow and the road's correlation of all frames, made once and kept in the cache.
+    # The data set: optical flow and the road's correlation of all frames, computed once and cached.
     flow = partial(with_motion, keep_images=False, cache=cache)
     drives = partial(KITTIOdometryExperienceReplay, args.root, colour=False, size=size, flow=flow, cache=cache)
     data = drives(args.train, mirrored=True, num_slices=8 if args.smoke else 32, slice_len=16)
@@ -100,7 +100,7 @@ def main() -> None:
         seen = env.rollout(drive.length)["next"]
         belief, truth = seen["belief", "mean"], seen["state"]
         dt = float(unseen[0]["dt"])
-        # The same sensor without a filter: its last reading is held where a frame is missing.
+        # The same sensor without a filter, with a zero-order hold for missing frames.
         with torch.no_grad():
             reading = denkf["sensor"](seen.clone())["sensor", "ensemble"].mean(-2)
         for t in range(1, len(reading)):
@@ -112,12 +112,12 @@ def main() -> None:
         for name, path in (("DEnKF", belief), ("dead reckoning", reckoned)):
             error = kitti_endpoint_error(path[:, :3], truth[:, :3], window=window)
             print(f"  {name:<15}{error.translation.item():.3f}  {error.rotation.item():.3f}")
-        print(f"  the 90 % intervals hold {100 * holds[0]:.0f} % of v and {100 * holds[1]:.0f} % of theta_dot")
+        print(f"  90 % coverage: v {100 * holds[0]:.0f} %, theta_dot {100 * holds[1]:.0f} %")
         draw(seen, reckoned, args.out / f"{drive.drive}.png")
 
 
 def draw(seen, reckoned: torch.Tensor, file: Path) -> None:
-    """The path with its ensemble beside the truth and dead reckoning; the velocities with their 90 % bands."""
+    """Draws the path with its ensemble, the truth and dead reckoning; the velocities with their 90 % bands."""
     import matplotlib
 
     matplotlib.use("agg")

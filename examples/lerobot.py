@@ -1,18 +1,18 @@
 """From a LeRobot folder to a belief on one page: a robot's joints from one of its cameras, also while the camera fails.
 
-    python examples/lerobot.py                                                      # a small folder that is made here
+    python examples/lerobot.py                                                      # makes a small folder first
     python examples/lerobot.py --root FOLDER --camera top --state observation.state --joints 7:14
 
-Any folder of LeRobot 2.0, 2.1 or 3.0 will do. The sensor reads the joints from single pictures. Where commands were
-recorded, they drive the filter's motion, which is learned. The page prints errors on unseen episodes beside those of
-simpler ways, and leaves a picture and a video in --out. ``kitti.py``, ``ur5.py`` and ``own_recordings.py`` are the same
-page for other robots. Needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"``.
+It reads any folder of LeRobot 2.0, 2.1 or 3.0. The sensor reads the joints from single images. Recorded commands, if
+any, drive the filter's motion, which is learned. The page prints errors on unseen episodes next to those of baselines,
+and writes a plot and a video to --out. ``kitti.py``, ``ur5.py`` and ``own_recordings.py`` are the same
+page for other robots. It needs pyarrow: ``pip install "torch_denkf[lerobot,plots]"``.
 
-Without --root it takes a minute of one core. Unseen episodes, no pictures in one second of four, mean absolute error of
+Without --root it takes a minute of one core. Unseen episodes, no images in one second of four, mean absolute error of
 two joints: 0.024 rad for the filter, 0.096 for the last reading, 0.047 for the filter without a camera, 0.47 for the
-mean pose; the 90 % intervals hold 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
-0.0096 rad, 0.0447, 0.0091 (its commands say it all), 0.1415; 84 %. A drawn crane of two joints, 20 episodes at 15 Hz
-with pictures two rows late, takes 1.5 minutes: 0.86 degrees, 2.92, 1.86, 27.6; 90 %.
+mean pose; 90 % coverage is 88 %. A Unitree G1's right arm takes four minutes with --updates 1000 300 200:
+0.0096 rad, 0.0447, 0.0091 (its commands suffice), 0.1415; 84 %. A synthetic crane of two joints, 20 episodes at 15 Hz
+with images two rows late, takes 1.5 minutes: 0.86 degrees, 2.92, 1.86, 27.6; 90 %.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from torch_denkf.training import FilterTrainer, Stage, choose, hold_last
 
 
 def write_folder(root: Path, episodes: int, rows: int) -> None:
-    """A LeRobot 2.1 folder of a two-joint arm that follows its commands with a lag; OpenCV draws it."""
+    """Writes a LeRobot 2.1 folder of a two-joint arm that follows its commands with a lag, drawn by OpenCV."""
     import pyarrow
     from pyarrow import parquet
 
@@ -94,7 +94,7 @@ def write_folder(root: Path, episodes: int, rows: int) -> None:
 
 
 def places_of(asked: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Places in the state of ``7:14``, ``3``, ``gripper`` or ``right_*``."""
+    """Returns indices in the state for ``7:14``, ``3``, ``gripper`` or ``right_*``."""
     places: list[int] = []
     for each in asked:
         first, colon, last = each.partition(":")
@@ -107,34 +107,34 @@ def places_of(asked: Sequence[str], names: Sequence[str]) -> list[int]:
 
 
 def dead(rows: TensorDict) -> torch.Tensor:
-    """When the camera fails here: in one second of four, ``[*B, 1]``."""
+    """Returns the mask of the camera's failure, one second of four, ``[*B, 1]``."""
     return rows["time"] % 4 >= 3
 
 
 def fail(rows: TensorDict) -> TensorDict:
-    """Rows whose pictures do not arrive while the camera is dead."""
+    """Returns rows whose images are missing while the camera fails."""
     return rows.set("observed", rows["observed"] & ~dead(rows))
 
 
 def go_black(rows: TensorDict) -> TensorDict:
-    """Rows whose pictures are black while the camera is dead. Nobody says so: it is seen in the pictures."""
+    """Returns rows whose images are black while the camera fails, which is detected from the images."""
     rows = BlackIsMissing()(rows.set("pixels", rows["pixels"] * ~dead(rows)[..., None, None]))
     return rows.set("observed", rows["seen"])
 
 
 def make_filter(data: LeRobotReplay) -> DEnKF:
-    """Learned motion, under the commands where there are any, and a sensor that reads the state from one picture."""
+    """Returns the filter: learned motion, driven by commands if there are any; a sensor that reads single images."""
     facts, row = data.statistics, data[0]
     loc, scale = facts["state", "mean"], facts["state", "std"].clamp_min(1e-3)  # a joint may never move
     joints, image, driven = len(loc), tuple(row["pixels"].shape), "action" in row
     commands = {"action_key": "action", "action_loc": facts["action", "mean"]} if driven else {}
     if driven:
         commands["action_scale"] = facts["action", "std"].clamp_min(1e-3)
-    # Linear: joints go after their commands, and stay where they are without. Widths such as (64, 64) in the place of
-    # () learn other motions, too.
+    # Linear: joints follow their commands, and stay where they are without commands. Widths such as (64, 64) instead
+    # of () learn other motions, too.
     motion = StochasticMLP(joints + (row["action"].shape[-1] if driven else 0), joints, (), output_gain=0.0)
     motion.requires_grad_(driven)
-    wind = (0.1 if driven else 0.3) * scale  # what moves joints in a step beside their commands, before training
+    wind = (0.1 if driven else 0.3) * scale  # process noise of the joints, before training
     wind = ConstantNoise(wind, trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=LearnedTransition(motion, loc=loc, scale=scale, **commands),
@@ -150,7 +150,8 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
         ),
         observation=Select(range(joints)),
         noise=ScaledNoise(DiagonalNoise(joints, r=0.5 * scale, loc=loc, scale=scale)),
-        analysis=EnsembleAnalysis("etkf"),  # its spread follows from R: the samples' own is that on familiar pictures
+        # The spread follows from R, as the samples' spread is that on training images.
+        analysis=EnsembleAnalysis("etkf"),
         initial=FromSensor(range(joints), mean=loc, std=scale, ensemble_size=32),
         process_noise=ScaledNoise(wind),
     )
@@ -158,13 +159,13 @@ def make_filter(data: LeRobotReplay) -> DEnKF:
 
 @torch.no_grad()
 def read(denkf: DEnKF, data: LeRobotReplay, **options) -> EpisodeReplay:
-    """Reads every picture by the sensor, once: a filter learns from readings many times as fast as from pictures."""
+    """Reads every image by the sensor once: a filter learns many times as fast from readings as from images."""
     parts = [denkf["sensor"](data[rows]).exclude("pixels") for rows in torch.arange(len(data)).split(256)]
     return EpisodeReplay(torch.cat(parts), data.episodes, for_tests=lambda episode: False, **options)
 
 
 def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path, updates: Sequence[int]) -> None:
-    """The sensor and the motion; then, on episodes that these have not seen, how far to trust them."""
+    """Trains the sensor and the motion, then the noise models on held-out episodes."""
     scale, trainer = denkf.initial.std, {"device": "cpu", "keep": "last"}
     of_sensor = SensorLoss(denkf, observation_scale=scale)
     of_motion = TransitionLoss(denkf, state_scale=scale)
@@ -172,9 +173,9 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
         Stage("sensor", of_sensor, data.draw, updates[0], weight_decay=0.02, lengths={0: 1}),
         Stage("motion", of_motion, data.draw, updates[1], lengths={0: 2}),
     ]
-    FilterTrainer(denkf, stages, out=out / "parts", **trainer).fit()  # goes on where it was broken off
+    FilterTrainer(denkf, stages, out=out / "parts", **trainer).fit()  # resumes after an interruption
 
-    # The filter behind its sensor: the same modules, for readings that were made before.
+    # The filter without its sensor: the same modules, for precomputed readings.
     behind = Filter({name: denkf[name] for name in denkf.module if name != "sensor"}, initial=denkf.initial)
     shortest = min(episode.length for episode in held_out.episodes)
     readings = read(denkf, held_out, num_slices=12, slice_len=min(48, shortest), transform=fail)
@@ -182,7 +183,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
     stage = Stage("filter", of_filter, readings.draw, updates[2], lr=4e-3)
     FilterTrainer(behind, [stage], out=out / "filter", **trainer).fit()
 
-    # One factor on all noise, with which the 90 % intervals hold 90 %.
+    # One factor on all noise sets the coverage of the 90 % intervals to 90 %.
     runs = readings.draw(torch.Generator().manual_seed(0), shortest)
 
     def from_level() -> float:
@@ -200,18 +201,22 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, help="LeRobot folder; a small one is made by default")
-    parser.add_argument("--camera", help="of the folder, where it has several")
+    parser.add_argument("--camera", help="of the folder, if it has several")
     parser.add_argument("--state", default="observation.state", help="feature that the belief is about")
     parser.add_argument(
         "--joints", nargs="+", default=[":"], help="of the state: 7:14, 3, gripper, right_*; default all"
     )
     parser.add_argument("--action", default="action", help="feature of the commands")
-    parser.add_argument("--no-commands", action="store_true", help="leave recorded commands out")
-    parser.add_argument("--episodes", nargs="+", type=int, help="numbers of those to read; all by default")
-    parser.add_argument("--lag", type=int, help="rows by which states are later than pictures; estimated by default")
-    parser.add_argument("--size", nargs=2, type=int, default=(96, 128), help="height and width to scale pictures to")
-    parser.add_argument("--held-out", type=float, default=0.2, help="share of the episodes that the sensor never sees")
-    parser.add_argument("--updates", nargs=3, type=int, help="of sensor, motion, filter; by default as the data ask")
+    parser.add_argument("--no-commands", action="store_true", help="ignore recorded commands")
+    parser.add_argument("--episodes", nargs="+", type=int, help="numbers of the episodes to read; all by default")
+    parser.add_argument("--lag", type=int, help="rows by which states are later than images; estimated by default")
+    parser.add_argument("--size", nargs=2, type=int, default=(96, 128), help="height and width to scale images to")
+    parser.add_argument(
+        "--held-out", type=float, default=0.2, help="share of the episodes without training of the sensor"
+    )
+    parser.add_argument(
+        "--updates", nargs=3, type=int, help="of sensor, motion, filter; by default from the size of the data"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/lerobot-page"))
     parser.add_argument("--smoke", action="store_true", help="a tiny run of everything")
     args = parser.parse_args()
@@ -229,7 +234,7 @@ def main() -> None:
         args.root, args.size = args.out / "folder", (64, 64)
         write_folder(args.root, 10 if args.smoke else 40, rows=50 if args.smoke else 100)
 
-    # The data: one episode of five is for tests, drawn by a hash. A repeated picture carries no news.
+    # The data: a hash assigns one episode of five to the tests. A repeated image has no new information.
     options = {"state_key": args.state, "size": tuple(args.size), "cache": args.out / "cache", "repeats": "mask"}
     options |= {"action_key": None if args.no_commands else args.action, "validation_share": args.held_out}
     options["episodes"] = args.episodes
@@ -248,7 +253,9 @@ def main() -> None:
     print(f"{len(data.episodes)} episodes, {len(data)} rows, {data.repeats_masked} of them with repeated pictures;")
     print(f"{len(joints)} of {width} numbers of the state, which are {args.lag} rows later than the pictures")
     args.updates = args.updates or (min(max(8 * len(data) // 64, 300), 3000), 400, 200)
-    digest = hashlib.sha256(repr(sorted(vars(args).items())).encode()).hexdigest()[:8]  # other options, other training
+    digest = hashlib.sha256(repr(sorted(vars(args).items())).encode()).hexdigest()[
+        :8
+    ]  # other options have another training
     denkf = make_filter(data)
     train(denkf, data, held_out, args.out / f"training-{digest}", args.updates)
 
@@ -257,23 +264,25 @@ def main() -> None:
     mean, seen, readings, alone = data.statistics["state", "mean"], [], [], []
     for episode in unseen.episodes[:5]:
         seen.append(believe(denkf, unseen, episode))
-        # The same sensor without a filter: its last reading is held where there is none. The same filter, blind.
+        # The same sensor without a filter, with a zero-order hold; and the same filter without a camera.
         reading = seen[-1]["sensor", "ensemble"].mean(-2)
         readings.append(hold_last(reading, seen[-1]["observed"], mean))
         alone.append(believe(denkf, blind, episode)["belief", "mean"])
-        seen[-1] = seen[-1] if len(seen) == 1 else seen[-1].exclude("pixels")  # the first one's are shown
+        seen[-1] = (
+            seen[-1] if len(seen) == 1 else seen[-1].exclude("pixels")
+        )  # only those of the first episode are shown
     names = [names[place] for place in joints]
     report(seen, {"last reading": readings, "no camera": alone}, mean, names)
     draw(seen[0], readings[0], data, names, args.out / unseen.episodes[0].name)
 
 
 def no_picture(rows: TensorDict) -> TensorDict:
-    """Rows of a robot without a camera."""
+    """Returns rows of a robot without a camera."""
     return rows.set("observed", torch.zeros_like(rows["observed"]))
 
 
 def believe(denkf: DEnKF, data: LeRobotReplay, episode: Episode) -> TensorDict:
-    """An episode as the robot would have seen it, with the belief in each row."""
+    """Replays an episode, and returns it with the belief in each row."""
     env = TransformedEnv(ReplayEnv(data, episodes=episode.name))
     env.append_transform(DEnKFTransform(denkf, diagnostics=[("sensor", "ensemble")]))
     torch.manual_seed(0)
@@ -281,7 +290,7 @@ def believe(denkf: DEnKF, data: LeRobotReplay, episode: Episode) -> TensorDict:
 
 
 def report(seen: list[TensorDict], others: dict[str, list], mean: torch.Tensor, names: Sequence[str]) -> None:
-    """Prints mean absolute errors and what the intervals hold, joint by joint."""
+    """Prints mean absolute errors and coverage of the intervals, joint by joint."""
     rows = torch.cat([run.exclude("pixels") for run in seen])
     belief, truth = rows["belief", "mean"], rows["state"]
     ways = {"DEnKF": belief, **{name: torch.cat(runs) for name, runs in others.items()}, "mean pose": mean}
@@ -294,7 +303,7 @@ def report(seen: list[TensorDict], others: dict[str, list], mean: torch.Tensor, 
 
 
 def draw(seen: TensorDict, reading: torch.Tensor, data: LeRobotReplay, names: Sequence[str], stem: Path) -> None:
-    """A picture and a video of the four joints that move most: 90 % bands, truth, readings; shaded without pictures."""
+    """Draws a plot and a video of the four joints that move most: 90 % bands, truth, readings; shaded if no images."""
     dims = sorted(data.statistics["state", "std"].argsort(descending=True)[:4].tolist())
     bands = {"dims": dims, "names": [names[dim] for dim in dims]}
     shared = {"observed": ~dead(seen), "time": seen["time"].flatten()}

@@ -1,22 +1,22 @@
-"""Many machines on one page: workers collect, ranks learn a filter and a policy on what it believes.
+"""Distributed training on one page: workers collect, ranks train a filter and a policy on its belief.
 
     python examples/many_machines.py                                             # all in this process
     pip install "torch_denkf[ray]" && python examples/many_machines.py --collectors 2
-    torchrun --nproc_per_node=2 examples/many_machines.py --collectors 2         # two ranks learn, two workers collect
+    torchrun --nproc_per_node=2 examples/many_machines.py --collectors 2         # 2 ranks learn, 2 workers collect
 
-dm_control's cartpole is to be balanced by noisy encoders; nobody measures its speeds. Filter and actor are one policy.
-So torchrl's RayCollector sends the filter's new weights to its workers like those of any policy. The filter learns from
-the simulator's true state, the policy by torchrl's SAC from the beliefs that were held while collecting.
+The task is to balance dm_control's cartpole from noisy encoders, without measured speeds. Filter and actor are one
+policy, so that torchrl's RayCollector sends the filter's new weights to its workers like those of any policy. The
+filter learns from the simulator's true state, the policy by torchrl's SAC from the beliefs at collection.
 
-Workers do not wait for each other. While one collects, the ranks go on learning, and its weights grow old. The policy
-carries the number of its weights (``WeightsNumber``), which every row tells. Rows whose weights are more than
-``--oldest`` versions behind are counted and refused. What is kept goes into one replay buffer, which the first rank
-holds for all: each rank learns from its own part of what is drawn there, and gradients are averaged.
+Workers do not wait for each other. While one collects, the ranks go on learning, and its weights become outdated. The
+policy has a version number of its weights (``WeightsNumber``), which it writes to every row. Rows whose weights are
+more than ``--oldest`` versions behind are counted and dropped. All other rows go into one replay buffer of the first
+rank: each rank learns from its part of a sampled batch, and gradients are averaged.
 
 For many machines: ``ray start --head`` on one and ``ray start --address HEAD:6379`` on the others, then ``--address
 auto`` and more collectors here. Each worker takes one core and needs this package; it gets the folder ``examples/``
-from here. On a busy machine workers start slowly: ray 2.60 waits half a minute for them, or as long as
-RAY_agent_register_timeout_ms says, and torchrl waits a minute for the first exchange of weights.
+from here. On a busy machine workers start slowly: ray 2.60 waits half a minute for them, or as set by
+RAY_agent_register_timeout_ms, and torchrl waits a minute for the first exchange of weights.
 
 In one process, 10 minutes of a core: the reward of a step rises from 0.38 to 0.82, of at most 1. One run.
 """
@@ -53,13 +53,13 @@ from torch_denkf.applications.reacher.encoders import NoisyEncoders
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, LearnedTransition, Select, StochasticMLP
 from torch_denkf.training import Processes
 
-WINDOW, EPISODE, REPEAT = 25, 100, 4  # steps: of a window that is learned from, of an episode, of the simulator in one
+WINDOW, EPISODE, REPEAT = 25, 100, 4  # steps of a training window, of an episode, of the simulator per step
 STD = torch.tensor([0.5, 0.3, 0.3, 1.0, 1.5])  # of the state: place m, cosine, sine of the pole, m/s, rad/s
 BELIEF = ("belief", "mean")
 
 
 class WeightsNumber(TensorDictModuleBase):
-    """Says which weights a row was collected with. It is a buffer, so that it travels with the weights."""
+    """Writes the version of the weights to each row. It is a buffer, so that it is sent with the weights."""
 
     def __init__(self):
         super().__init__()
@@ -71,7 +71,7 @@ class WeightsNumber(TensorDictModuleBase):
 
 
 def make_filter() -> DEnKF:
-    """State [place, cosine, sine, speed, turn rate]; the encoders read the first three."""
+    """Returns a filter of [place, cosine, sine, speed, turn rate]; the encoders read the first three."""
     return DEnKF(
         LearnedTransition(StochasticMLP(5 + 1, 5, (64, 64), output_gain=0.1), scale=STD, action_key="action"),
         None,
@@ -83,7 +83,7 @@ def make_filter() -> DEnKF:
 
 
 def make_env(denkf: DEnKF, seed: int | None = None) -> EnvBase:
-    """Cartpole with noisy encoders, and what a filter in a policy needs. Runs in the worker."""
+    """Returns the cartpole with noisy encoders and the transforms of a filter in a policy. Runs in the worker."""
     state = CatTensors(in_keys=["position", "velocity"], out_key="state", del_keys=False)
     env = TransformedEnv(DMControlEnv("cartpole", "balance", frame_skip=REPEAT))
     for transform in (DoubleToFloat(), NoisyEncoders(0.05), state, RewardScaling(0.0, 1 / REPEAT)):
@@ -95,7 +95,7 @@ def make_env(denkf: DEnKF, seed: int | None = None) -> EnvBase:
 
 
 def make_policy(denkf: DEnKF) -> tuple[TensorDictSequential, ProbabilisticActor, ValueOperator]:
-    """Filter, actor and the number of the weights, one after the other; the actor alone; the critic."""
+    """Returns the policy of filter, actor and version of the weights; the actor alone; the critic."""
     head = nn.Sequential(MLP(5, 2, num_cells=[64, 64]), NormalParamExtractor())
     options = {"in_keys": ["loc", "scale"], "distribution_class": TanhNormal, "default_interaction_type": "random"}
     actor = ProbabilisticActor(TensorDictModule(head, [BELIEF], ["loc", "scale"]), **options)
@@ -104,7 +104,7 @@ def make_policy(denkf: DEnKF) -> tuple[TensorDictSequential, ProbabilisticActor,
 
 
 def make_collector(policy: TensorDictSequential, args: argparse.Namespace):
-    """A RayCollector, or the same in this process."""
+    """Returns a RayCollector, or a collector in this process."""
     total = args.batches * args.frames
     if args.collectors == 0:
         return Collector(partial(make_env, policy[0]), policy, frames_per_batch=args.frames, total_frames=total)
@@ -116,7 +116,7 @@ def make_collector(policy: TensorDictSequential, args: argparse.Namespace):
         policy,
         frames_per_batch=args.frames,
         total_frames=total,
-        sync=False,  # nobody waits: a batch is that of one worker
+        sync=False,  # workers do not wait: a batch comes from one worker
         ray_init_config={
             "address": args.address,  # None: starts ray here
             "runtime_env": folder,
@@ -129,7 +129,7 @@ def make_collector(policy: TensorDictSequential, args: argparse.Namespace):
 
 
 def windows(data: TensorDictBase, newest: int, oldest: int) -> tuple[TensorDictBase, TensorDictBase]:
-    """The rows of a batch as windows ``[N, WINDOW]``: those whose weights are new enough, and the others."""
+    """Returns the windows ``[N, WINDOW]`` of a batch: those with recent weights, and the others."""
     keys = ("encoder", "action", "state", "is_init", "weights_number", BELIEF)
     rows = data.reshape(-1).select(*keys, ("next", "reward")).reshape(-1, WINDOW)
     age = newest - rows["weights_number"][:, 0, 0]
@@ -140,7 +140,7 @@ def windows(data: TensorDictBase, newest: int, oldest: int) -> tuple[TensorDictB
 
 
 def transitions(batch: TensorDictBase) -> TensorDict:
-    """Rows ``[N]`` for SAC: the belief of the next row stands beside each, but for the last of an episode."""
+    """Returns rows ``[N]`` for SAC: each with the belief of the next row, except the last of an episode."""
     first, second = batch[:, :-1], batch[:, 1:]
     rows = first.select(BELIEF, "action")
     rows["next"] = second.select(BELIEF).update({"reward": first["next", "reward"]})
@@ -149,7 +149,7 @@ def transitions(batch: TensorDictBase) -> TensorDict:
 
 
 class Learner:
-    """Updates of the filter, and of actor and critic, by all ranks together."""
+    """Updates filter, actor and critic by all ranks together."""
 
     def __init__(self, denkf: DEnKF, actor: ProbabilisticActor, critic: ValueOperator, processes: Processes):
         self.filter_loss = DEnKFLoss(denkf, sensor=0.0, transition=0.0, state_scale=STD)
@@ -161,7 +161,7 @@ class Learner:
         self.processes = processes
 
     def __call__(self, batch: TensorDictBase) -> float:
-        """One update of the filter by windows, and many of the policy by their rows; returns the filter's CRPS."""
+        """Updates the filter on windows and the policy on their rows; returns the filter's CRPS."""
         crps = self.descend(self.filter_loss(batch.exclude("belief", "next")), self.filter_optimiser)
         rows = transitions(batch)
         for part in torch.randperm(len(rows)).chunk(8):
@@ -170,7 +170,7 @@ class Learner:
         return crps
 
     def descend(self, terms: TensorDictBase, optimiser: torch.optim.Optimizer) -> float:
-        """One step of an optimiser, by the gradient of all ranks."""
+        """Takes one step of an optimiser with the mean gradient of all ranks; returns the loss."""
         total = sum(value for name, value in terms.items() if name.startswith("loss_"))
         optimiser.zero_grad()
         total.backward()
@@ -207,7 +207,7 @@ def main() -> None:
     collector = make_collector(policy, args) if processes.is_main else None
     buffer = ReplayBuffer(storage=LazyTensorStorage(args.batches * args.frames // WINDOW), batch_size=64)
     if processes.is_main:
-        collector.update_policy_weights_()  # ray's wants it before the first batch, too
+        collector.update_policy_weights_()  # ray needs it before the first batch, too
         batches = iter(collector)
     ages, refused, rewards = [], 0, []
     try:
@@ -221,13 +221,13 @@ def main() -> None:
                 if len(fresh):
                     buffer.extend(fresh)
             if processes.any(processes.is_main and len(buffer) == 0):
-                continue  # all that came was too old
+                continue  # all rows so far were outdated
             for _ in range(args.updates):
                 batch = processes.share(buffer.sample() if processes.is_main else None)
                 crps = learner(batch.chunk(processes.world_size)[processes.rank])
             number += 1
             if processes.is_main:
-                collector.update_policy_weights_()  # to every worker, wherever it is
+                collector.update_policy_weights_()  # to all workers
     finally:
         if processes.is_main:
             collector.shutdown()

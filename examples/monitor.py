@@ -1,11 +1,11 @@
-"""Noticing on one page: a cart whose GPS is off for a while, and nobody says so.
+"""Monitoring on one page: a cart whose GPS has an unannounced bias for a while.
 
-    python examples/monitor.py              # leaves runs/monitor.png
+    python examples/monitor.py              # writes runs/monitor.png
     python examples/monitor.py --out there.png
 
-A filter believes its sensors as much as it was told. The program watches the innovations, raises an alarm, and lets a
-gate answer: with both, the error while the GPS is off is a fraction of what it is without. It also says which bias it
-could not have noticed. It takes ten seconds; the page behind this one is ``docs/how_to/monitor.md``.
+A filter weights its sensors by their noise covariance. The program monitors the innovations, raises an alarm, and lets
+a gate reject readings: the error during the fault is then a fraction of that without a gate. It also prints the
+largest bias that it cannot detect. It takes ten seconds; the documentation is in ``docs/how_to/monitor.md``.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, 
 from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor
 
 DT, PUSH, NOISE = 0.1, 0.05, 0.3  # s, m/s a step, m
-OFF, BACK, BIAS = 120, 160, 4.0  # steps at which the GPS goes off and comes back, m
+OFF, BACK, BIAS = 120, 160, 4.0  # first step of the GPS's bias, first step after it, and its size in m
 
 
 def make_cart() -> DEnKF:
-    """An ensemble filter of [position m, speed m/s]."""
+    """Returns an ensemble filter of [position m, speed m/s]."""
     walk = torch.nn.Linear(2, 2, bias=False)
     walk.weight.data = torch.tensor([[1.0, DT], [0.0, 0.99]])
     return DEnKF(
@@ -42,7 +42,7 @@ def make_cart() -> DEnKF:
 
 
 def record(runs: int, steps: int, *, off: bool) -> TensorDict:
-    """Carts that are pushed at random, and their GPS, which may be off for a while."""
+    """Returns carts with random pushes and their GPS, with a bias for a while if ``off``."""
     speed = [0.3 * torch.randn(runs)]
     for _ in range(steps - 1):
         speed.append(0.99 * speed[-1] + PUSH * torch.randn(runs))
@@ -56,7 +56,7 @@ def record(runs: int, steps: int, *, off: bool) -> TensorDict:
 
 
 def draw(path: str, plain: TensorDict, gated: TensorDict, limit: float) -> None:
-    """Innovation statistic, alarm, and the errors with and without the gate, of the first cart."""
+    """Draws innovation statistic, alarm, and the errors with and without the gate, of the first cart."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -85,7 +85,7 @@ def draw(path: str, plain: TensorDict, gated: TensorDict, limit: float) -> None:
 
 
 def error_of(out: TensorDict) -> Tensor:
-    """Error of the position, ``[runs, steps]`` in m."""
+    """Returns the error of the position, ``[runs, steps]`` in m."""
     return (out["belief", "mean"] - out["state"])[..., 0].abs()
 
 
@@ -99,7 +99,7 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(1)
 
-    # What is watched, and how often it may cry wolf. The distributions come from clean recordings.
+    # The monitored sensors, and the rate of false alarms. The distributions come from clean recordings.
     monitor = InnovationMonitor({"gps": MonitoredSensor("info", 1)}, window=10, false_alarm_rate=1e-3)
     watched = Monitored(make_cart(), monitor)
     clean = [record(4 * runs, steps, off=False)]
@@ -107,14 +107,14 @@ def main() -> None:
     smallest = monitor.detectable_bias()["gps"]
     print(f"A bias of the innovations below {smallest:.1f} standard deviations passes unnoticed in a second.")
 
-    # The same filter, whose analysis does not believe what three steps speak against.
+    # The same filter with a gate on the innovations of three steps.
     gated = Gated(make_cart(), 1, response="reject", window=3, rate=1e-4, patience=60).calibrate(clean)
 
     sound, broken = record(runs, steps, off=False), record(runs, steps, off=True)
     quiet, plain, answered = watched.sequence(sound.clone()), watched.sequence(broken.clone()), gated.sequence(broken)
     alarm = plain["monitor", "alarm"][..., 0]
     delay = alarm[:, OFF:BACK].float().argmax(1)
-    print(f"False alarms on sound runs: in {1000 * quiet['monitor', 'alarm'].float().mean():.1f} of 1,000 steps.")
+    print(f"False alarms on fault-free runs: in {1000 * quiet['monitor', 'alarm'].float().mean():.1f} of 1,000 steps.")
     print(f"The GPS goes off: alarm {delay.float().median():.0f} steps after (median of {runs} carts).")
     for name, out in (("without a gate", plain), ("with a gate", answered)):
         during, after = error_of(out)[:, OFF:BACK].mean(), error_of(out)[:, BACK + 10 :].mean()
@@ -122,7 +122,7 @@ def main() -> None:
     draw(options.out, plain, answered, monitor.cusum_limit.item())
     print(f"Picture: {options.out}")
 
-    # In an environment the alarm stands beside the belief.
+    # In an environment the alarm is stored next to the belief.
     motion = torch.tensor([[1.0, DT], [0.0, 0.99]])
     plant = LinearGaussianEnv(motion, torch.eye(1, 2), [0.0, PUSH], [NOISE], initial_std=[0.3, 0.3], seed=0)
     rollout = TransformedEnv(plant, DEnKFTransform(Monitored(make_cart(), monitor))).rollout(20)

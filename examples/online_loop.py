@@ -1,10 +1,10 @@
-"""A belief in a loop of one's own on one page: a cart, an encoder that comes and goes, a clock that stutters.
+"""A filter in a control loop on one page: a cart, an encoder with dropout, irregular time steps.
 
     python examples/online_loop.py
 
-No environment, no data set and no training: the motion is known. The loop asks the filter to ``step`` where a reading
-has arrived, to ``predict`` where none has, and to step ``without=`` a sensor that is silent. Each step lasts as long as
-the clock says. It takes a few seconds. The page behind this one is ``docs/how_to/online_loop.md``; other robots are in
+No environment, no data set and no training: the motion is known. The loop calls the filter's ``step`` if a reading
+has arrived, ``predict`` if none has, and ``step`` with ``without=`` for a silent sensor. The length of each step is
+read from the clock. It takes a few seconds. The documentation is in ``docs/how_to/online_loop.md``; other robots are in
 ``examples/kitti.py``, ``ur5.py``, ``lerobot.py`` and ``own_recordings.py``.
 """
 
@@ -18,11 +18,11 @@ from torch import Tensor, nn
 from torch_denkf import Filter
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, Select, Transition
 
-PUSH = 0.8  # m/s^2: how the speed walks at random, a standard deviation after a second
+PUSH = 0.8  # m/s, random walk of the speed: its standard deviation after a second
 
 
 class Coasting(Transition):
-    """A cart [position m, speed m/s] whose speed walks at random, over as many seconds as have passed."""
+    """Motion of a cart [position m, speed m/s] whose speed is a random walk, over steps of any length."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "ensemble"), "seconds"], [("forecast", "ensemble")])
@@ -35,7 +35,7 @@ class Coasting(Transition):
 
 
 def make_filter(members: int = 200) -> Filter:
-    """Two sensors, each with its own noise and analysis: a position in m and a speed in m/s."""
+    """Returns a filter of two sensors, each with its own noise and analysis: a position in m and a speed in m/s."""
     return Filter(
         {
             "transition": Coasting(),
@@ -63,13 +63,13 @@ def make_filter(members: int = 200) -> Filter:
 
 
 class Cart:
-    """Stands for your hardware: the true cart, its clock, and the readings that happen to have arrived."""
+    """Simulates the hardware: the true cart, its clock, and its readings."""
 
     def __init__(self):
         self.time, self.state = 0.0, torch.tensor([0.5, 1.0])
 
     def read(self) -> tuple[float, dict[str, list[float]]]:
-        """Seconds since the last call, and the readings: between 6 and 9 s there are none of the encoder."""
+        """Returns the seconds since the last call, and the readings; the encoder has a dropout from 6 to 9 s."""
         dt = 0.1 * (0.5 + torch.rand(()).item())
         speed = self.state[1] + PUSH * dt**0.5 * torch.randn(())
         self.state = torch.stack([self.state[0] + dt * (self.state[1] + speed) / 2, speed])
@@ -93,7 +93,7 @@ def main() -> None:
     denkf, cart = make_filter(), Cart()
     sensors = ["encoder", "radar"]
     inside, steps, shown = torch.zeros(2), 0, 0.0
-    print("time    true position, speed    believed position, 90 %     speed, 90 %             readings")
+    print("time    true position, speed    estimated position, 90 %    speed, 90 %             readings")
     with torch.no_grad():  # otherwise a graph grows with every step
         belief = denkf.initialise({})
         while cart.time < (2.0 if args.smoke else args.seconds):
@@ -103,7 +103,7 @@ def main() -> None:
             if len(silent) == len(sensors):
                 belief = denkf.predict(belief)
             else:
-                belief = denkf.step(belief, without=silent)  # or the last reading of the silent one would count again
+                belief = denkf.step(belief, without=silent)  # otherwise its last reading would be used again
             mean, half = belief["belief", "mean"], 1.645 * belief["belief", "var"].sqrt()
             inside, steps = inside + ((mean - cart.state).abs() < half), steps + 1
             if cart.time >= shown:
@@ -113,9 +113,7 @@ def main() -> None:
                 text = f"{true[0]:6.2f} m  {true[1]:5.2f} m/s     {position} m   {speed} m/s"
                 print(f"{cart.time:4.1f} s  {text}   {' '.join(readings) or 'none'}")
     holds = (100 * inside / steps).tolist()
-    print(
-        f"{steps} steps; the 90 % intervals hold {holds[0]:.0f} % of the positions and {holds[1]:.0f} % of the speeds"
-    )
+    print(f"{steps} steps; 90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %")
 
 
 if __name__ == "__main__":

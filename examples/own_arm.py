@@ -1,12 +1,12 @@
-"""An arm of your own, from camera to policy, on one page: MuJoCo, a camera, encoders, and actions that run late.
+"""A custom arm, from camera to policy, on one page: MuJoCo, a camera, encoders, and actions with latency.
 
-    python examples/own_arm.py             # pictures, filter and policy in runs/own-arm
+    python examples/own_arm.py             # plots, filter and policy in runs/own-arm
 
-``Reach`` and ``XML`` stand for your arm: two joints; a camera of 60 x 60 pixels in each of 20 steps a second, encoders
-in every fourth; 30 % of both get lost, and nobody reads speeds. A scripted controller demonstrates. The filter learns
-motion and camera from that, and what the camera is worth from demonstrations that it did not learn from. Then PPO
-learns to reach a goal, from the belief of the moment when its action runs, 0.1 s later. Needs OpenGL, no screen
-(``MUJOCO_GL=egl``). docs/how_to/own_arm.md has the numbers.
+``Reach`` and ``XML`` stand for your arm: two joints, a camera of 60 x 60 pixels at 20 Hz, encoders at 5 Hz. 30 % of
+both are missing, and no sensor reads speeds. A scripted controller gives demonstrations. The filter learns
+motion and camera from them, and the camera's errors from held-out demonstrations. Then PPO
+learns to reach a goal, from the predicted belief at the time when its action runs, 0.1 s later. It needs OpenGL, but no
+screen (``MUJOCO_GL=egl``). docs/how_to/own_arm.md has the numbers.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ from torch_denkf.modules import (
 from torch_denkf.plots import plot_bands
 from torch_denkf.training import take_weights
 
-DT, STEPS, LATE = 0.05, 60, 2  # s of a step; steps of an episode; of sensing, inference and bus together
-ENCODER, LOST = 0.05, 0.3  # rad; share of the readings
+DT, STEPS, LATE = 0.05, 60, 2  # s of a step; steps of an episode; latency of sensing, inference and bus, in steps
+ENCODER, LOST = 0.05, 0.3  # noise in rad; share of missing readings
 XML = """<mujoco>
   <option timestep="0.01"/>
   <visual><quality offsamples="0" shadowsize="0"/><global offwidth="60" offheight="60"/></visual>
@@ -105,7 +105,7 @@ XML = """<mujoco>
 
 
 class Reach(control.Task):
-    """Shows the arm by camera and encoders; the task is to reach the joint angles of a goal."""
+    """Task of reaching the joint angles of a goal, with observations of camera and encoders."""
 
     def __init__(self):
         self._random, self.goal, self.ticks = np.random.RandomState(0), np.zeros(2), 0  # torchrl seeds ``_random``
@@ -136,7 +136,7 @@ class Reach(control.Task):
 
 
 def make_env(count: int, seed: int, *transforms) -> TransformedEnv:
-    """Arms side by side, of which 30 % of the readings get lost."""
+    """Returns a batch of arms with 30 % of the readings missing."""
 
     def one() -> EnvBase:
         arm = control.Environment(mujoco.Physics.from_xml_string(XML), Reach(), STEPS * DT, control_timestep=DT)
@@ -151,10 +151,10 @@ def make_env(count: int, seed: int, *transforms) -> TransformedEnv:
 
 
 def demonstrate(episodes: int, seed: int) -> TensorDict:
-    """Rollouts of a controller that knows the truth, and shakes: ``[episodes, STEPS]``."""
+    """Returns rollouts of a controller on the truth with random actions added: ``[episodes, STEPS]``."""
 
     def controller(state, goal):
-        shake = torch.randn(len(goal), 1) * torch.randn_like(goal)  # some episodes more
+        shake = torch.randn(len(goal), 1) * torch.randn_like(goal)  # more in some episodes
         return (3.0 * (goal - state[:, :2]) - 0.5 * state[:, 2:] + shake).clamp(-1, 1)
 
     with torch.no_grad():
@@ -162,11 +162,11 @@ def demonstrate(episodes: int, seed: int) -> TensorDict:
 
 
 def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], members: int = 32) -> FusedFilter:
-    """State [angles rad, speeds rad/s]; a learned motion, the camera, the encoders.
+    """Returns a filter of [angles rad, speeds rad/s] with a learned motion, the camera, and the encoders.
 
     Args:
         facts: means and standard deviations of the demonstrations; plain numbers, for the filter's ``config.json``.
-        error: of the camera, in rad: ``white``, and where it is known ``std`` and ``time`` of what lasts, in steps.
+        error: of the camera, in rad: ``white``, and, if known, ``std`` and ``time`` (steps) of the coloured part.
         members: of the ensemble.
     """
     loc, scale = torch.tensor(facts["mean"]), torch.tensor(facts["std"])
@@ -200,7 +200,7 @@ def make_filter(facts: dict[str, list[float]], error: dict[str, list[float]], me
 
 @torch.no_grad()
 def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[str, list[float]]:
-    """The camera's errors on rows ``[B, T]``, as white noise, or as what lasts from picture to picture beside some."""
+    """Estimates the camera's errors on rows ``[B, T]``: as white noise, or as white and coloured noise."""
     off = model["camera_sensor"](rows.copy())["sensor", "camera", "ensemble"].mean(-2) - rows["state"][..., :2]
     off = torch.where(rows["observed"], off, torch.nan)
     if not lasting:
@@ -212,9 +212,9 @@ def camera_errors(model: FusedFilter, rows: TensorDict, lasting: bool) -> dict[s
 def learn(
     rollouts: TensorDict, unseen: TensorDict, out: Path, updates: tuple[int, int, int]
 ) -> tuple[FusedFilter, dict]:
-    """Motion and camera on three quarters of the demonstrations; the camera's errors, then the whole, on the others.
+    """Trains motion and camera on three quarters of the demonstrations, error model and filter on the others.
 
-    On pictures that it learned from the camera's errors are too small.
+    The camera's errors on its training images would be too small.
     """
     split = partial(EpisodeReplay.from_rollouts, rollouts, DT, validation_share=0.25, num_slices=16, slice_len=20)
     data, held = split(), split(split="validation")
@@ -244,16 +244,16 @@ def learn(
 
 
 def errors(model: FusedFilter, rollouts: TensorDict, *without: str) -> tuple[TensorDict, str]:
-    """Root mean squared errors of the belief on rollouts, maybe without a sensor."""
+    """Returns beliefs on rollouts, maybe without a sensor, and their root mean squared errors as text."""
     data = rollouts.exclude("next").clone()
     for key in without:
         data[key] = torch.zeros_like(data[key])
     with torch.no_grad():
         out = model.sequence(data)[:, 10:]
-    mean, var = out["belief", "mean"][..., :4], out["belief", "var"][..., :4]  # behind them, the camera's bias
+    mean, var = out["belief", "mean"][..., :4], out["belief", "var"][..., :4]  # the camera's bias follows
     error = (mean - out["state"]).square().mean((0, 1)).sqrt()
     holds = interval_coverage(mean, var, out["state"], level=0.9).mean()
-    return out, f"{error[:2].mean():.3f} rad, {error[2:].mean():.2f} rad/s, 90 % intervals hold {100 * holds:.0f} %"
+    return out, f"{error[:2].mean():.3f} rad, {error[2:].mean():.2f} rad/s, 90 % coverage {100 * holds:.0f} %"
 
 
 def make_actor() -> ProbabilisticActor:
@@ -265,7 +265,7 @@ def make_actor() -> ProbabilisticActor:
 
 
 def late_env(model: FusedFilter, count: int, seed: int, key=("ahead", "belief", "mean")) -> TransformedEnv:
-    """Arms whose actions run late; the filter, and what the policy sees: a belief and the goal."""
+    """Returns arms with latency and the filter, and the policy's input: a belief and the goal."""
     keep = [("belief", "mean"), ("belief", "var")]
     belief = DEnKFTransform(model, ahead=BeliefAhead(model, LATE, keep=keep))
     return make_env(
@@ -299,14 +299,14 @@ def ppo(model: FusedFilter, actor: ProbabilisticActor, batches: int, arms: int =
 
 @torch.no_grad()
 def test(model: FusedFilter, actor: ProbabilisticActor, key, arms: int) -> float:
-    """The mean return where the policy sees another entry."""
+    """Returns the mean return of the policy with the belief under ``key`` as its input."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return late_env(model, arms, 1000, key).rollout(STEPS, actor)["next", "reward"].sum((1, 2)).mean().item()
 
 
 @torch.no_grad()
 def run(model: FusedFilter, actor: ProbabilisticActor) -> tuple[float, float]:
-    """Runs a loop without an environment, as on the robot; yields the return of an episode and the ms of a cycle."""
+    """Runs a loop as on the robot, and returns the return of an episode and the milliseconds of a cycle."""
     arm, ahead = make_env(1, 2000), BeliefAhead(model, LATE)
     under_way, total, seconds = deque([torch.zeros(2)] * LATE), 0.0, []
     row = arm.reset()
@@ -358,7 +358,7 @@ def main() -> None:
     axes[0].figure.savefig(args.out / "arm.png", dpi=80)
     if not args.batches:
         return
-    # The policy on the belief of the moment when its action runs.
+    # The policy on the predicted belief at the time when its action runs.
     actor = make_actor()
     curve = ppo(model, actor, args.batches, arms)
     print(f"return of an episode: {curve[0]:.1f} in the first batch")

@@ -1,16 +1,16 @@
-"""From a folder of one's own recordings to a belief on one page: a cart on a rail, its encoder and a camera.
+"""From a folder of recordings to a belief on one page: a cart on a rail, its encoder and a camera.
 
-    python examples/own_recordings.py                    # recordings that are made here
-    python examples/own_recordings.py --root FOLDER      # runs of your own, files of the same names
+    python examples/own_recordings.py                    # simulates recordings first
+    python examples/own_recordings.py --root FOLDER      # your own runs, in files of the same names
 
 A run is three files: ``RUN.mp4`` from the camera, ``RUN-encoder.csv`` (time, speed) from an encoder on a wheel, and
-``RUN-truth.csv`` (time, position, speed) from what you trust, such as a tracker, to train and to score with. Each has a
-rate of its own, here 10, 100 and 50 Hz, on one clock in s. The camera sees where the cart is, the encoder how fast it
-goes, with gaps. ``examples/kitti.py``, ``ur5.py`` and ``lerobot.py`` are the same page for other robots.
+``RUN-truth.csv`` (time, position, speed) from a reference, such as a tracker, for training and scores. Each has a
+different rate, here 10, 100 and 50 Hz, on one clock in s. The camera observes the position, the encoder the speed,
+with gaps. ``examples/kitti.py``, ``ur5.py`` and ``lerobot.py`` are the same page for other robots.
 
 Without --root it takes about a minute and a half of one core. Three unseen runs, 30 % of the frames missing: the filter
-is off by about 2 cm and 10 cm/s, the last readings by about 6 cm and 19 cm/s (root mean squared errors). The 90 %
-intervals hold 97 % of the positions and 88 % of the speeds.
+has errors of about 2 cm and 10 cm/s, the last readings of about 6 cm and 19 cm/s (root mean squared errors). The
+coverage of the 90 % intervals is 97 % for the position and 88 % for the speed.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ from torch_denkf.modules import (
 from torch_denkf.plots import plot_bands
 from torch_denkf.training import hold_last
 
-RATE = 20.0  # rows a second of the data set
+RATE = 20.0  # rows per second of the data set
 
 
 def make_recordings(root: Path, runs: int, seconds: float) -> None:
-    """Stands for your recordings: a cart that is pushed along a rail of 1.2 m between two springs."""
+    """Simulates recordings, in place of yours: a cart that is pushed along a rail of 1.2 m between two springs."""
     root.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     for run in range(runs):
@@ -85,7 +85,7 @@ def make_recordings(root: Path, runs: int, seconds: float) -> None:
 
 
 def read(root: Path, **options) -> RecordingReplay:
-    """The runs of a folder on one clock. A hash of a run's name says for which split it is."""
+    """Returns the runs of a folder on one clock; a hash of a run's name decides its split."""
     runs = [
         Recording(
             name=video.stem,
@@ -99,11 +99,11 @@ def read(root: Path, **options) -> RecordingReplay:
 
 
 def make_filter(data: RecordingReplay) -> Filter:
-    """Learned motion; the camera's sensor and its analysis; then the encoder's, on what the camera left."""
+    """Returns a filter of learned motion, the camera's sensor and analysis, and the encoder's analysis after it."""
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     transition = LearnedTransition(StochasticMLP(2, 2, output_gain=0.1), loc=loc, scale=scale)
-    pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # what may change in a step beside the learned motion
+    pushes = (torch.tensor([0.01, 0.2]) * scale).tolist()  # process noise of a step
     initial = FromSensor([0], mean=loc, std=scale, ensemble_size=32)
     encoder = {"observation_key": "encoder", "observed_key": "encoder_observed"}
     encoder |= {"predicted_key": "encoder_predicted", "noise_variance_key": "encoder_noise"}
@@ -132,7 +132,7 @@ def make_filter(data: RecordingReplay) -> Filter:
 
 
 def train(model: Filter, data: RecordingReplay, out: Path, updates: tuple[int, int]) -> None:
-    """The sensor alone, then all of the filter through 20 steps; resumes where it was broken off."""
+    """Trains the sensor alone, then the whole filter through 20 steps; resumes after an interruption."""
     scale = data.statistics["state", "std"]
     loss = DEnKFLoss(model, state_scale=scale, observation_scale=scale[:1], nll=0.02)
     sensor = Stage("sensor", SensorLoss(model, observation_scale=scale[:1]), data.draw, updates[0], lengths={0: 8})
@@ -155,13 +155,13 @@ def main() -> None:
         args.root = args.out / "recordings"
         make_recordings(args.root, runs=24, seconds=4.0 if args.smoke else 20.0)
 
-    # The data set: rows 20 times a second; every second one has a picture of its own.
+    # The data set: rows 20 times a second; every second row has a new image.
     cache = args.out / "cache"
     data = read(args.root, cache=cache, num_slices=8, slice_len=20)
     model = make_filter(data)
     train(model, data, args.out / "training", tuple(args.updates))
 
-    # The replay environment, with the filter in it: any torchrl code can step it. One element of the batch a run.
+    # The replay environment, with the filter in it: any torchrl code can step it. Each run is an element of the batch.
     unseen = read(args.root, cache=cache, split="test")
     shortest = min(run.length for run in unseen.episodes)
     env = TransformedEnv(ReplayEnv(unseen, batch_size=[len(unseen.episodes)], length=shortest))
@@ -170,7 +170,7 @@ def main() -> None:
     torch.manual_seed(0)
     seen = env.rollout(shortest)["next"]
     belief, truth = seen["belief", "mean"], seen["state"]
-    # The same sensors without a filter: what each read last is held.
+    # The same sensors without a filter, with a zero-order hold.
     start = data.statistics["state", "mean"].expand(len(seen), 2)
     position = hold_last(seen["sensor", "ensemble"].mean(-2), seen["observed"], start[:, :1])
     reading = torch.cat([position, hold_last(seen["encoder"], seen["encoder_observed"], start[:, 1:])], -1)
@@ -179,12 +179,12 @@ def main() -> None:
         error = 100 * (states - truth).square().mean((0, 1)).sqrt()
         print(f"  {name:<15}{error[0]:.1f}  {error[1]:.1f}")
     holds = 100 * interval_coverage(belief, seen["belief", "var"], truth, level=0.9)
-    print(f"  the 90 % intervals hold {holds[0]:.0f} % of the positions and {holds[1]:.0f} % of the speeds")
+    print(f"  90 % coverage: position {holds[0]:.0f} %, speed {holds[1]:.0f} %")
     draw(seen[0], reading[0], args.out / f"{unseen.episodes[0].name}.png")
 
 
 def draw(seen, reading: torch.Tensor, file: Path) -> None:
-    """Position and speed with their 90 % bands, the truth and what was read; shaded where the encoder is silent."""
+    """Draws position and speed with their 90 % bands, truth and readings; shaded in gaps of the encoder."""
     reading = reading.where(torch.cat([seen["observed"], seen["encoder_observed"]], -1), torch.nan)
     dots, names = {dim: reading[:, dim] for dim in (0, 1)}, ["position, cm", "speed, cm/s"]
     shaded = {"observed": "encoder_observed", "time": 1 / RATE}

@@ -1,11 +1,11 @@
-"""A policy on a belief on one page: a pendulum is swung up by its noisy encoder alone, with torchrl's PPO.
+"""A policy on a belief on one page: a pendulum's swing-up from a noisy encoder alone, with torchrl's PPO.
 
     python examples/policy.py                # CSV files and a learning curve in runs/policy
     python examples/policy.py --tensorboard
 
-Nobody measures the speed, and the motor is too weak to lift the pendulum at once. One line appends a filter to the
-environment. The filter learns gravity and motor from what the policy collects, while it collects, by the likelihood of
-the readings (``DEnKFLoss.ad_enkf``): it never sees the true state. recurrent_policy.py is the same with torchrl's LSTM.
+The speed is not measured, and the motor is too weak to lift the pendulum at once. One line appends a filter to the
+environment. The filter learns gravity and motor from the policy's data during collection, by the likelihood of
+the readings (``DEnKFLoss.ad_enkf``), without the true state. recurrent_policy.py is the same with torchrl's LSTM.
 
 It takes about one minute of one core. Return of 100 new episodes after 99,200 steps: -188 on the belief, and -236 with
 the LSTM (one run each); a policy that reads the true state returns about -150. The filter ends with a pull of 15.00
@@ -34,11 +34,11 @@ from torch_denkf import DEnKF, DEnKFLoss, DEnKFTransform, NoisyPendulumEnv
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, NoisyTransition, Select, Transition
 from torch_denkf.training import RunLogs
 
-COUNT, STEPS, NOISE = 16, 200, 0.1  # pendulums side by side; steps of an episode; of the cosine and sine that are read
+COUNT, STEPS, NOISE = 16, 200, 0.1  # pendulums in a batch; steps of an episode; noise of the read cosine and sine
 
 
 class Swing(Transition):
-    """The filter's motion: what pulls and how strong the motor is, in 1/s^2 (per Nm), is learned from nothing."""
+    """The filter's motion: pull of gravity, in 1/s^2, and strength of the motor, in 1/s^2 per Nm, are learned."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
@@ -55,27 +55,27 @@ class Swing(Transition):
 
 
 class LearningFilter:
-    """A filter of [cosine, sine, speed], and its training on the episodes ``[B, T]`` that came so far."""
+    """A filter of [cosine, sine, speed], and its training on all episodes ``[B, T]`` so far."""
 
     def __init__(self, episodes: int):
         gusts = ConstantNoise([0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
         parts = {
             "transition": NoisyTransition(Swing(), gusts, dims=[2], before=True),
-            "sensor": None,  # the encoder is read as it is
+            "sensor": None,  # the encoder is read directly
             "observation": Select([0, 1]),
             "noise": ConstantNoise([0.5, 0.5], trainable=True, in_key="observation"),
             "analysis": EnsembleAnalysis("etkf", observation_key="observation"),
         }
         first, later = (GaussianPrior([0.0] * 3, [0.7, 0.7, speed], ensemble_size=32) for speed in (0.6, 3.0))
         self.filter = DEnKF(**parts, initial=first, update_at_reset=True)
-        # Windows begin anywhere in an episode, where the speed is not known.
+        # Windows begin anywhere in an episode, with an unknown speed.
         self.loss = DEnKFLoss.ad_enkf(DEnKF(**parts, initial=later, update_at_reset=True))
         self.optimiser = torch.optim.Adam(self.filter.parameters(), lr=0.05)
         self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimiser, 0.993)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(episodes), batch_size=16)
 
     def learn(self, data: TensorDict, updates: int, length: int) -> dict[str, float]:
-        """Makes updates on windows of a length."""
+        """Adds episodes, and runs updates on windows of a length."""
         self.buffer.extend(data.select("observation", "observed", "action"))
         for _ in range(updates):
             start = torch.randint(data.shape[1] - length + 1, ())
@@ -85,13 +85,13 @@ class LearningFilter:
             nn.utils.clip_grad_norm_(self.filter.parameters(), 1.0)
             self.optimiser.step()  # the collector's filter is this one
             self.schedule.step()
-        error = (data["belief", "mean"] - data["state"])[..., 2].square().mean().sqrt()  # for the log alone
+        error = (data["belief", "mean"] - data["state"])[..., 2].square().mean().sqrt()  # only for the log
         pull, motor = self.filter["transition"].module["transition"].tenths.mul(10).tolist()
         return {"loss_filter": loss.item(), "speed_rmse": error.item(), "pull": pull, "motor": motor}
 
 
 def make_actor(module: nn.Module, in_keys: list, *before: TensorDictModuleBase) -> ProbabilisticActor:
-    """A Gaussian torque in Nm, which the motor clamps; ``before`` writes what the module reads."""
+    """Returns an actor of a Gaussian torque in Nm, which the motor clamps; ``before`` writes the module's input."""
     spread = AddStateIndependentNormalScale(1, init_value=0.7)  # 2 Nm at first
     nn.init.normal_(module[-1].weight, std=0.001)
     head = TensorDictModule(nn.Sequential(module, spread), in_keys, ["loc", "scale"])
@@ -108,7 +108,7 @@ def ppo(
     lr: float = 1e-3,
     learn: Callable[[TensorDict, int, int], dict[str, float]] | None = None,
 ) -> float:
-    """Trains a policy on batches of whole episodes, in slices of time; the mean return of 100 test episodes."""
+    """Trains a policy on batches of whole episodes, in slices of time; returns the mean return of 100 test episodes."""
     gae = GAE(gamma=0.95, lmbda=0.9, value_network=critic, average_gae=True, deactivate_vmap=True)
     loss = ClipPPOLoss(actor, critic, entropy_bonus=False, critic_coeff=0.5, loss_critic_type="l2")
     optimiser = torch.optim.Adam(loss.parameters(), lr=lr)
@@ -125,7 +125,7 @@ def ppo(
         logs.log(values, step=(number + 1) * rows)
         bar.set_postfix({name: f"{value:.2f}" for name, value in values.items()})
         if learn is not None and number == 0:
-            continue  # these beliefs are of a filter that knew nothing
+            continue  # these beliefs come from an untrained filter
         data["next", "reward"] = 0.1 * data["next", "reward"]
         with torch.no_grad(), set_recurrent_mode(True):
             gae(data)

@@ -1,16 +1,16 @@
 """Track a car from its camera: train a DEnKF, append it to an environment, roll out unseen drives.
 
-    python examples/quickstart.py                                                  # drives that are generated here
+    python examples/quickstart.py                                                  # renders the drives first
     python examples/quickstart.py --root KITTI --train 00 02 05 --test 09          # real KITTI odometry drives
 
 Four steps, each a function below:
 
 1. ``read_drives``    frames and true states of the drives, in KITTI's layout
 2. ``train_sensor``   the image sensor alone: (v, theta_dot) from a frame and its difference to the one before
-3. ``train_filter``   transition, sensor curve h and noise model on drives the sensor has not seen, through 32 steps
+3. ``train_filter``   transition, sensor curve h and noise model on held-out drives, through 32 steps
 4. ``track``          DEnKFTransform in a replay environment of each test drive, 30 % of the frames missing
 
-It prints a table against the sensor alone and against dead reckoning, and leaves a picture in ``--out``.
+It prints a comparison with the sensor alone and with dead reckoning, and writes a plot to ``--out``.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ INITIAL_STD = [0.0, 0.0, 0.0, 0.3, 0.02]  # m, m, rad, m/s, rad/s: the pose is w
 
 
 def read_drives(args: argparse.Namespace) -> tuple[list[TensorDict], list[TensorDict]]:
-    """Returns the training and the test drives; generates them where no --root is given."""
+    """Returns the training and the test drives; generates them without ``--root``."""
     if args.root is None:
         args.pixel_noise = 0.05 if args.pixel_noise is None else args.pixel_noise
         args.root, names = args.out / "drives", [f"{i:02d}" for i in range(args.drives + 4)]
@@ -69,15 +69,15 @@ def read_drives(args: argparse.Namespace) -> tuple[list[TensorDict], list[Tensor
 
 
 def with_noise(drive: TensorDict, std: float) -> TensorDict:
-    """Adds white noise to every image, as a cheap camera does; ``std`` is a share of full scale."""
-    drive = drive.clone()  # in memory: what was read is a memory map
+    """Adds white noise to every image, as from a cheap camera; ``std`` is a share of full scale."""
+    drive = drive.clone()  # in memory, because the drive is a memory map
     for image in drive["image"]:
         image.copy_((image + 255 * std * torch.randn(image.shape)).clamp(0, 255).round())
     return drive
 
 
 def make_filter(frames: TensorDict, dt: float) -> DEnKF:
-    """The paper's filter for visual odometry: known motion of the pose, learned change of the velocities."""
+    """Returns the paper's filter for visual odometry: known motion of the pose, learned change of the velocities."""
     velocity = frames["state"][:, VELOCITIES]
     loc, scale = velocity.mean(0), velocity.std(0)
     image_shape = tuple(frames["pixels"].shape[1:])
@@ -101,11 +101,11 @@ def make_filter(frames: TensorDict, dt: float) -> DEnKF:
 
 
 class SensorCurve(nn.Module):
-    """h of the paper: what the sensor reads at a true speed; one that hedges reads slow as faster, fast as slower."""
+    """Measurement model h of the paper, for a sensor whose readings of the speed are biased towards their mean."""
 
     def __init__(self, loc: torch.Tensor, scale: torch.Tensor):
         super().__init__()
-        self.correction = StochasticMLP(1, 1, (), layer="none", output_gain=0.0)  # linear; starts at "as it is"
+        self.correction = StochasticMLP(1, 1, (), layer="none", output_gain=0.0)  # linear; starts as the identity
         self.register_buffer("loc", loc[:1])
         self.register_buffer("scale", scale[:1])
 
@@ -140,11 +140,11 @@ def train_sensor(denkf: DEnKF, frames: TensorDict, updates: int) -> None:
 
 
 def read_windows(sensor: ImageSensor, drives: list[TensorDict], length: int) -> tuple[TensorDict, torch.Tensor]:
-    """Returns all windows of the sensor's readings, and mirrored ones; and the standard deviation of its errors."""
+    """Returns all windows of the sensor's readings, also mirrored, and the standard deviation of its errors."""
     with torch.no_grad():  # the sensor reads every frame once; the filter without it trains on the readings
         readings = [sensor(d.copy()).exclude("pixels", "is_init") for drive in drives for d in (drive, mirror(drive))]
     for reading in readings:
-        reading["target_observation"] = reading["sensor", "ensemble"].mean(1)  # what h is to predict
+        reading["target_observation"] = reading["sensor", "ensemble"].mean(1)  # the target of h
     errors = torch.cat([reading["target_observation"] - reading["state"][:, VELOCITIES] for reading in readings])
     windows = [r[i : i + length] for r in readings for i in range(1, len(r) - length + 1)]
     return torch.stack(windows), errors.std(0)
@@ -153,7 +153,7 @@ def read_windows(sensor: ImageSensor, drives: list[TensorDict], length: int) -> 
 def train_filter(denkf: DEnKF, drives: list[TensorDict], updates: int, length: int = 32) -> None:
     """Fits transition, h and noise model end to end through ``length`` steps, on the frozen sensor's readings."""
     windows, error_std = read_windows(denkf["sensor"], drives, length)
-    # Windows start from a velocity that is wrong: a filter that always starts at the truth learns to hold on to it.
+    # Windows start from a noisy velocity: a filter that always starts at the truth learns to trust its start.
     start_std = torch.cat([torch.zeros(3), 0.3 * denkf["sensor"].scale])
     recursion = DEnKF(
         sensor=None,
@@ -168,7 +168,7 @@ def train_filter(denkf: DEnKF, drives: list[TensorDict], updates: int, length: i
     for _ in (bar := tqdm(range(updates), desc="training the filter", disable=None)):
         batch = windows[torch.randint(len(windows), (64,))]
         batch["start"] = batch["state"] + start_std * torch.randn(64, 1, 5)
-        kept = torch.rand(64, length + 1, 1) >= 0.5 * torch.rand(64, 1, 1)  # frames; a pair needs both of its own
+        kept = torch.rand(64, length + 1, 1) >= 0.5 * torch.rand(64, 1, 1)  # frames; a pair needs both of its frames
         batch["observed"] = batch["observed"] & kept[:, 1:] & kept[:, :-1]
         terms = loss(batch)
         optimiser.zero_grad()
@@ -180,7 +180,7 @@ def train_filter(denkf: DEnKF, drives: list[TensorDict], updates: int, length: i
 
 
 def track(denkf: DEnKF, drive: TensorDict, missing: float) -> TensorDict:
-    """Loses some frames of a drive, appends the filter to its replay, and rolls it out."""
+    """Removes some frames of a drive, appends the filter to its replay, and rolls it out."""
     drive = drive.clone()
     drive["frame_valid"] &= torch.rand(len(drive), 1) >= missing
     env = TransformedEnv(KITTIReplayEnv(drive), DEnKFTransform(denkf, diagnostics=[("sensor", "ensemble")]))
@@ -188,7 +188,7 @@ def track(denkf: DEnKF, drive: TensorDict, missing: float) -> TensorDict:
 
 
 def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dict[str, torch.Tensor]:
-    """The states [T, 5] that the filter, the sensor alone and dead reckoning make of one drive."""
+    """Returns the states [T, 5] of one drive by the filter, the sensor alone and dead reckoning."""
     start, readings, observed = rollout["state"][0, :3], rollout["sensor", "ensemble"].mean(1), rollout["observed"]
     held = hold_last(readings, observed, rollout["state"][0, VELOCITIES])
 
@@ -204,7 +204,7 @@ def estimate(rollout: TensorDict, mean_velocity: torch.Tensor, dt: float) -> dic
 
 
 def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> str:
-    """A Markdown table of errors, averaged over the drives."""
+    """Returns a Markdown table of errors, averaged over the drives."""
     lines = [
         f"| | translation, m/m over {window} steps | rotation, deg/m | v, RMSE m/s | theta_dot, RMSE deg/s |",
         "|---|---|---|---|---|",
@@ -221,10 +221,8 @@ def compare(rollouts: list[TensorDict], estimates: list[dict], window: int) -> s
     belief, truth = together["belief"], together["state"]
     v, theta_dot = 100 * interval_coverage(belief["mean"], belief["var"], truth, level=0.9)[VELOCITIES]
     blind = 100 * (1 - torch.cat([r["observed"] for r in rollouts]).float().mean())
-    lines.append(
-        f"\nThe sensor is blind in {blind:.0f} % of the steps. The DEnKF's 90 % intervals hold {v:.0f} % of v and "
-    )
-    return "\n".join(lines) + f"{theta_dot:.0f} % of theta_dot."
+    lines.append(f"\nThe sensor is blind in {blind:.0f} % of the steps. 90 % coverage of the DEnKF: v {v:.0f} %, ")
+    return "\n".join(lines) + f"theta_dot {theta_dot:.0f} %."
 
 
 def draw(rollout: TensorDict, estimates: dict, dt: float, file: Path) -> None:
@@ -273,13 +271,13 @@ def main() -> None:
     if args.root is not None and (not args.train or len(args.train) < 2 or not args.test):
         parser.error("--root needs --train with two drives or more, and --test")
     torch.manual_seed(args.seed)
-    torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))  # small steps: threads that wait for cores cost more
+    torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))  # small steps: more threads would wait for cores
     args.out.mkdir(parents=True, exist_ok=True)
 
     training, tests = read_drives(args)
     dt = float(tests[0]["dt"][0])
     frames = [drive_frames(drive) for drive in training]
-    held = max(1, len(frames) // 4)  # drives that the sensor does not see, so that its errors there are honest
+    held = max(1, len(frames) // 4)  # held-out drives, on which the sensor's errors are those on new data
     sensor_frames = torch.cat(frames[:-held])
     denkf = make_filter(sensor_frames, dt)
     train_sensor(denkf, sensor_frames, args.sensor_updates)

@@ -1,15 +1,15 @@
-"""A recurrent policy on one page: the pendulum of policy.py, with torchrl's LSTM in the place of the filter.
+"""A recurrent policy on one page: the pendulum of policy.py, with torchrl's LSTM instead of the filter.
 
     python examples/recurrent_policy.py
 
-Actor and critic share an ``LSTMModule`` of 64 units that reads the encoder and the last torque. What torchrl needs for
-it: ``InitTracker`` marks resets, a primer carries the hidden state through the environment, and the loss is fed slices
-of time, each of which begins with the hidden state that was collected there. PPO, its settings and the logs are those
-of policy.py, but for a learning rate three times as large: at that of policy.py this LSTM returns -511.
+Actor and critic share an ``LSTMModule`` of 64 units that reads the encoder and the last torque. torchrl needs three
+parts for it: ``InitTracker`` marks resets, a primer carries the hidden state through the environment, and the loss gets
+slices of time, each of which begins with the stored hidden state. PPO, its settings and the logs are those
+of policy.py, except for a learning rate three times as large: at that of policy.py this LSTM returns -511.
 
-All readings arrive here. With ``NoisyPendulumEnv(missing=...)`` a missing one is NaN, and an LSTM that reads NaN writes
-NaN without an error. Then append ``torch_denkf.envs.HoldReading()``, and let ``CatTensors`` take ``"held"``, the
-last reading that arrived, in the place of ``"observation"``.
+No readings are missing here. With ``NoisyPendulumEnv(missing=...)`` a missing one is NaN, and an LSTM that reads NaN
+writes NaN without an error. Then append ``torch_denkf.envs.HoldReading()``, and give ``CatTensors`` ``"held"``, the
+last reading that arrived, instead of ``"observation"``.
 
 It takes 40 seconds of one core. Return of 100 new episodes after 99,200 steps: -236, on the belief -188 (one run each).
 """

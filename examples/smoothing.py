@@ -1,10 +1,10 @@
-"""Looking back on one page: a pendulum whose encoder reads every fifth step, filtered, and then smoothed.
+"""Smoothing on one page: a pendulum whose encoder reads every fifth step, filtered, and then smoothed.
 
     python examples/smoothing.py
 
-A filter knows the past; a smoother also knows what came later. The program compares both on recordings, shows a lag of
-a few steps in an environment that runs, and lets a loss score the smoothed belief. No data set, and no training but a
-few steps. It takes ten seconds. The page behind this one is ``docs/how_to/smoothing.md``; the measured errors of all
+A filter uses past readings; a smoother also uses later ones. The program compares both on recordings, runs a fixed-lag
+smoother in an environment, and trains with a loss on the smoothed belief for a few steps. It needs no data set, and
+takes ten seconds. The documentation is in ``docs/how_to/smoothing.md``; the measured errors of all
 smoothers are in ``docs/results/smoothing.md``.
 """
 
@@ -32,12 +32,12 @@ from torch_denkf import (
 )
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, MomentPrior, Select
 
-DT, PUSH, NOISE, EVERY = 0.05, 0.15, 0.1, 5  # s; rad/s a step; rad; steps between readings
+DT, PUSH, NOISE, EVERY = 0.05, 0.15, 0.1, 5  # s; rad/s per step; rad; steps between readings
 START = torch.tensor([0.5, 0.0]), torch.tensor([0.5, 0.5])  # mean and standard deviation of [angle rad, rate rad/s]
 
 
 class Swing(nn.Module):
-    """A pendulum's [angle, rate] one step later; its length in metres is a parameter."""
+    """Maps a pendulum's [angle, rate] one step ahead; its length in metres is a parameter."""
 
     def __init__(self, length: float = 1.0):
         super().__init__()
@@ -50,7 +50,7 @@ class Swing(nn.Module):
 
 
 def record(runs: int, steps: int) -> TensorDict:
-    """True states, and the encoder's readings of the angle."""
+    """Returns true states, and the encoder's readings of the angle."""
     swing, state, states = Swing(), START[0] + START[1] * torch.randn(runs, 2), []
     for _ in range(steps):
         states.append(state)
@@ -62,7 +62,7 @@ def record(runs: int, steps: int) -> TensorDict:
 
 
 def make_denkf(swing: Swing | None = None, members: int = 100) -> DEnKF:
-    """An ensemble filter of the pendulum."""
+    """Returns an ensemble filter of the pendulum."""
     return DEnKF(
         transition=LearnedTransition(swing or Swing(), residual=False),
         sensor=None,
@@ -75,7 +75,7 @@ def make_denkf(swing: Swing | None = None, members: int = 100) -> DEnKF:
 
 
 def make_ukf() -> UKF:
-    """An unscented Kalman filter of the pendulum."""
+    """Returns an unscented Kalman filter of the pendulum."""
     return UKF(
         LearnedTransition(Swing(), residual=False),
         None,
@@ -88,7 +88,7 @@ def make_ukf() -> UKF:
 
 
 def show(name: str, mean: Tensor, var: Tensor, truth: Tensor) -> None:
-    """Errors of angle and rate, and how often the 90 % intervals hold the truth."""
+    """Prints errors of angle and rate, and the coverage of the 90 % intervals."""
     error = mean - truth
     angle, rate = error.square().flatten(0, 1).mean(0).sqrt().tolist()
     inside = 100 * (error.abs() < 1.645 * var.sqrt()).float().mean().item()
@@ -104,7 +104,7 @@ def main() -> None:
     recordings = record(runs, steps)
     truth = recordings["state"]
 
-    print(f"{'RMSE over recordings':34s} angle       rate          90 % intervals hold")
+    print(f"{'RMSE over recordings':34s} angle       rate          90 % coverage")
     smoothers = {
         "DEnKF, EnKS, 5 steps ahead": EnKS(make_denkf(), lag=5),
         "DEnKF, EnRTS, 5 steps ahead": EnRTS(make_denkf(), lag=5),
@@ -118,7 +118,7 @@ def main() -> None:
             show(name.split(",")[0] + ", the filter alone", out["belief", "mean"], out["belief", "var"], truth)
         show(name, out["smoothed", "mean"], out["smoothed", "var"], truth)
 
-    # While it runs: the belief of now, and a better one of 10 steps ago. Small swings: a linear system.
+    # Online: the belief at present, and a smoothed one 10 steps earlier. Small swings are a linear system.
     swing, angle = torch.tensor([[1.0, DT], [-9.81 * DT, 1.0 - 0.1 * DT]]), torch.tensor([[1.0, 0.0]])
     plain = LinearGaussianEnv(swing, angle, [0.0, PUSH], [NOISE], missing=0.5, batch_size=[runs], seed=0)
     noises = {"process_noise": [0.0, PUSH], "noise": [NOISE]}
@@ -130,7 +130,7 @@ def main() -> None:
     print(f"  the rate now is known to {now[..., 1].square().mean().sqrt():.3f} rad/s,")
     print(f"  that of 10 steps ago to  {then[..., 1].square().mean().sqrt():.3f} rad/s")
 
-    # A loss may score what is believed in hindsight: here it finds the length, which starts twice too large.
+    # A loss may score the smoothed belief: here it finds the length, which starts twice too large.
     swing = Swing(length=2.0)
     denkf = make_denkf(swing, members=30)
     loss = DEnKFLoss(denkf, state=0.0, transition=0.0, smoothed=1.0, smoother=partial(EnRTS, lag=10))

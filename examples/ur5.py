@@ -1,17 +1,17 @@
-"""From demos to a belief on one page: a UR5 arm's joints and gripper from a camera that looks at its table.
+"""From demos to a belief on one page: a UR5 arm's joints and gripper from a camera above its table.
 
-    python examples/ur5.py                  # demos that are collected here: MuJoCo, an expert that picks and pushes
-    python examples/ur5.py --root DEMOS     # a folder that `denkf collect-ur5` filled,
+    python examples/ur5.py                  # collects demos first: MuJoCo, an expert that picks and pushes
+    python examples/ur5.py --root DEMOS     # reads a folder of `denkf collect-ur5`
 
-The camera sends a picture every seventh step, about. The sensor reads joints and place from it; the filter learns how
-commands move the arm, and goes on between pictures. ``examples/kitti.py``, ``lerobot.py`` and ``own_recordings.py`` are
+The camera sends an image about every seventh step. The sensor reads joints and position from it; the filter learns how
+commands move the arm, and predicts between images. ``examples/kitti.py``, ``lerobot.py`` and ``own_recordings.py`` are
 the same page for other robots. The full study, with every filter and disturbance, is ``python -m benchmarks.ur5``.
 
-Without --root it takes about four minutes of one core. 40 unseen demos with pictures in 10 % of the steps, mean
+Without --root it takes about four minutes of one core. 40 unseen demos with images in 10 % of the steps, mean
 absolute error: joints about 5 degrees and place 2.8 cm for the filter, 10 degrees and 2.8 cm for the last reading. The
-sensor has learned from few demos at 64 px, and the 90 % intervals hold 76 %. This arm follows its commands well: the
-last command alone is off by 1.4 degrees. The study, with a larger sensor and more demos, reaches 1.5 degrees from
-pictures alone.
+sensor has learned from few demos at 64 px, and the 90 % coverage is 76 %. This arm follows its commands well: the
+last command alone has an error of 1.4 degrees. The study, with a larger sensor and more demos, reaches 1.5 degrees from
+images alone.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ UNITS = [180 / math.pi] * 7 + [100.0] * 3  # the state is in rad and m
 
 
 def make_filter(data: UR5ExperienceReplay) -> DEnKF:
-    """Learned motion of the ten numbers under commands, and a sensor that reads all of them from one picture."""
+    """Returns the filter: learned motion of ten components under commands; a sensor that reads them from one image."""
     facts = data.statistics
     loc, scale = facts["state", "mean"], facts["state", "std"]
     image = tuple(data[0]["pixels"].shape)
@@ -81,7 +81,7 @@ def make_filter(data: UR5ExperienceReplay) -> DEnKF:
 
 
 def train(denkf: DEnKF, shots: UR5ExperienceReplay, data: UR5ExperienceReplay, out: Path, updates) -> None:
-    """The sensor on single pictures, then all of the filter through 32 steps; resumes where it was broken off."""
+    """Trains the sensor on single images, then the whole filter through 32 steps; resumes after an interruption."""
     scale = data.statistics["state", "std"]
     of_sensor = SensorLoss(denkf, observation_scale=scale)
     of_filter = DEnKFLoss(denkf, state_scale=scale, observation_scale=scale, nll=0.02)
@@ -95,7 +95,7 @@ def train(denkf: DEnKF, shots: UR5ExperienceReplay, data: UR5ExperienceReplay, o
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, help="folder of demos; collected by default")
-    parser.add_argument("--demos", type=int, default=200, help="to collect, where no --root is given")
+    parser.add_argument("--demos", type=int, default=200, help="to collect, without --root")
     parser.add_argument("--out", type=Path, default=Path("runs/ur5-page"))
     parser.add_argument("--updates", nargs=2, type=int, default=(1500, 300), help="of the sensor and of the filter")
     parser.add_argument("--smoke", action="store_true", help="a tiny run of everything")
@@ -110,23 +110,23 @@ def main() -> None:
         with tqdm(total=args.demos, desc="collecting demos") as bar:
             collect_ur5_demos(args.root, args.demos, size=(64, 64), progress=bar.update, **few)
 
-    # The data set: a hash of its number says for which split a demo is.
+    # The data set: a hash of a demo's number assigns its split.
     demos = partial(UR5ExperienceReplay, args.root, cache=args.out / "cache")
     data, shots = demos(num_slices=2 if args.smoke else 8, slice_len=32), demos(frames_only=True, batch_size=64)
     denkf = make_filter(shots)
     train(denkf, shots, data, args.out / "training", tuple(args.updates))
 
-    # The replay environment, with the filter in it: any torchrl code can step it. One element of the batch a demo.
+    # The replay environment, with the filter in it: any torchrl code can step it. Each demo is an element of the batch.
     unseen = demos(split="test")
     env = TransformedEnv(ReplayEnv(unseen, batch_size=[len(unseen.episodes)]))
     env.append_transform(MissingFrames(0.3))
     env.append_transform(DEnKFTransform(denkf, diagnostics=[("sensor", "ensemble")]))
-    env.append_transform(ExcludeTransform("pixels"))  # they have been read
+    env.append_transform(ExcludeTransform("pixels"))  # already read by the sensor
     torch.manual_seed(0)
     rollout = env.rollout(1000)
     seen = rollout["next"]
     belief, truth = seen["belief", "mean"], seen["state"]
-    # The same sensor without a filter: its last reading is held where a frame is missing.
+    # The same sensor without a filter, with a zero-order hold for missing frames.
     reading = hold_last(seen["sensor", "ensemble"].mean(-2), seen["observed"], data.statistics["state", "mean"])
     holds = 100 * interval_coverage(belief, seen["belief", "var"], truth, level=0.9)
     seldom = 100 * seen["observed"].float().mean()
@@ -138,14 +138,12 @@ def main() -> None:
         print(f"  {name:<15}{error[:7].mean():.2f}  {error[7:].mean():.2f}")
     late = (rollout["action"] - truth[..., :7]).abs().mean() * UNITS[0]
     print(f"  {'last command':<15}{late:.2f}")
-    print(
-        f"  the 90 % intervals hold {holds[:7].mean():.0f} % of the joints and {holds[7:].mean():.0f} % of the places"
-    )
+    print(f"  90 % coverage: joints {holds[:7].mean():.0f} %, positions {holds[7:].mean():.0f} %")
     draw(seen[0], reading[0], args.out / f"{unseen.episodes[0].name}.png")
 
 
 def draw(seen, reading: torch.Tensor, file: Path) -> None:
-    """Three joints and a place of one demo with their 90 % bands, the truth, and the last readings."""
+    """Draws three joints and a place of one demo with their 90 % bands, the truth, and the last readings."""
     dims = [0, 1, 3, 7]
     axes = plot_bands(
         seen,

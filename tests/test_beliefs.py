@@ -32,7 +32,7 @@ def completed(given, wanted, **options):
         (("count",), Belief),
     ],
 )
-def test_the_names_that_are_carried_tell_the_kind(carried, kind):
+def test_kind_of_belief_from_carried_names(carried, kind):
     keys = names("ensemble", "mean", "cov", "var", "log_weight")
     (found,) = kinds_of([*keys, *names(*carried)], carry=names(*carried))
     assert type(found) is kind
@@ -86,7 +86,7 @@ def test_weighted_particles_moments(float64):
     mean = (weight * ensemble).sum(-2)
     torch.testing.assert_close(out["belief", "mean"], mean)
     assert not out["belief", "mean"].allclose(ensemble.mean(-2), atol=1e-3)
-    with pytest.raises(KeyError, match=r"'cov'.* does not follow"):  # not that of equal weights
+    with pytest.raises(KeyError, match=r"'cov'.* cannot be computed"):  # not that of equal weights
         completed(given, names("cov"))
 
 
@@ -94,7 +94,7 @@ def test_a_covariances_variances(float64):
     cov = torch.tensor([[2.0, 0.5], [0.5, 1.0]])
     out = completed(entries(mean=torch.zeros(2), cov=cov), names("var"))
     assert out["belief", "var"].equal(torch.tensor([2.0, 1.0]))
-    with pytest.raises(KeyError, match=r"'ensemble'.* does not follow"):
+    with pytest.raises(KeyError, match=r"'ensemble'.* cannot be computed"):
         completed(entries(mean=torch.zeros(2), cov=cov), names("ensemble"))
 
 
@@ -106,23 +106,23 @@ def test_on_a_circle_the_mean_of_members_is_that_of_directions(float64):
     assert float(var) == pytest.approx(2 * (torch.pi - 3.1) ** 2)
 
 
-def test_what_does_not_follow_is_looked_for_where_the_belief_is_stored(float64):
+def test_independent_entries_are_read_from_the_stored_belief(float64):
     given = entries(ensemble=torch.randn(4, 2))
     age = torch.tensor([3.0])
     out = completed(given, names("mean", "age"), stored=entries(age=age, mean=torch.full((2,), torch.nan)))
     assert out["belief", "age"] is age
     assert out["belief", "mean"].isfinite().all()  # it follows
-    with pytest.raises(KeyError, match=r"'age'.* does not follow .*store it"):
+    with pytest.raises(KeyError, match=r"'age'.* cannot be computed .*store it"):
         completed(given, names("age"))
 
 
-def test_what_is_there_is_left_alone():
+def test_existing_entries_are_kept():
     given = entries(mean=torch.zeros(2), cov=torch.eye(2), var=torch.full((2,), 7.0))
     out = completed(given, names("mean", "cov", "var"))
     assert all(out[key] is value for key, value in given.items())
 
 
-def test_moments_beside_what_is_carried_belong_to_the_belief():
+def test_uncarried_moments_belong_to_the_belief():
     written = [*names("ensemble", "mean", "var", "cov", "gain"), ("info", "mean"), "mean"]
     assert summary_keys(names("ensemble"), written) == names("mean", "var", "cov")
 

@@ -26,7 +26,7 @@ def unpickles(name, keywords):
 
 
 @pytest.mark.parametrize("text", ["torch.load(f)", "TensorDict.load_memmap(f)", "np.load(f, allow_pickle=True)"])
-def test_it_looks(text):
+def test_search_finds_files(text):
     assert any(unpickles(*call) for call in calls(text))
 
 

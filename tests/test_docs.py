@@ -24,7 +24,7 @@ def name(path):
 
 
 #: Pages whose programs train for more than eight seconds.
-LONG = {"train_motion_first", "wheeled_robot", "three_ways", "labels_by_hand", "own_dynamics", "own_loss", "outliers"}
+LONG = {"train_motion_first", "own_log", "three_ways", "labels_by_hand", "own_dynamics", "own_loss", "outliers"}
 
 
 def blocks():

@@ -1,6 +1,6 @@
-"""All angles turned by half a circle: the same belief, turned by half a circle, of every module that knows of angles.
+"""Rotating all angles by pi rotates the belief by pi and changes nothing else, for every module with angles.
 
-Headings near zero wrap nowhere. Turned by pi, readings and predictions lie on both sides of the cut at +-pi.
+Headings near zero never wrap. Rotated by pi, readings and predictions lie on both sides of the cut at +-pi.
 """
 
 import ast
@@ -48,12 +48,12 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def folded(value):
-    """The first component between -pi and pi."""
+    """Wraps the first component to [-pi, pi]."""
     return torch.cat([torch.atan2(value[..., :1].sin(), value[..., :1].cos()), value[..., 1:]], -1)
 
 
 class Heading(SubModel):
-    """A compass, and beside it what it does not turn: reads both components of the state, or the heading alone."""
+    """Measurement model h of a compass: both components of the state, or the heading alone."""
 
     def __init__(self, count=2):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
@@ -67,7 +67,7 @@ class Heading(SubModel):
 
 
 class Sensor(SubModel):
-    """Reads what is there."""
+    """Passes an entry on as the sensor's ensemble."""
 
     def __init__(self, key):
         super().__init__(nn.Identity(), [key], [("sensor", "ensemble")])
@@ -90,7 +90,7 @@ def moments(turn):
 
 
 def frames(turn):
-    """Readings, what a sensor draws of them, their labels; the truth jumps, so that gates act."""
+    """Returns readings, samples of a sensor, and labels; the true state jumps, so that gates act."""
     generator = torch.Generator().manual_seed(2)
     state = ahead(turn) + 0.1 * torch.randn(B, T, 2, generator=generator).cumsum(1)
     state[:, 7:] += torch.tensor([1.2, 3.0])
@@ -164,7 +164,7 @@ def learned_likelihood():
 
 
 def fused(motion, *, delay=0, weights=False, joint=False, analysis=None):
-    """A compass that draws samples, and another sensor; the compass may be late."""
+    """Returns a maker of filters with a compass that draws samples, and another sensor."""
 
     def make(turn):
         sensors = {
@@ -189,25 +189,25 @@ def fused(motion, *, delay=0, weights=False, joint=False, analysis=None):
     return make
 
 
-def heeding(make):
-    """The filter, whose update heeds how likely it is that its sensor sees."""
+def with_visibility(make):
+    """Adds the probability of occlusion to a filter's update."""
 
-    def heeds(turn):
+    def made(turn):
         filter = make(turn)
         return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
-    return heeds
+    return made
 
 
 def contaminated(make):
-    """The filter, of whose readings a share is wrong."""
+    """Adds a share of outliers to a filter's noise model."""
 
-    def doubts(turn):
+    def made(turn):
         filter = make(turn)
         divergence = 0.0 if isinstance(filter, ParticleFilter) else 0.1
         return filter.with_modules(analysis=Contaminated(filter["analysis"], 0.3, width=3.0, divergence=divergence))
 
-    return doubts
+    return made
 
 
 def gated(make, **options):
@@ -231,13 +231,13 @@ FILTERS = {
     "local with a lag": lambda turn: FixedLag(local()(turn), 3),
     "Kalman": kalman,
     **{kind.__name__: gaussian(kind) for kind in (EKF, UKF, BackpropKF)},
-    "EKF with errors that last": lambda turn: gaussian(EKF, sensor_error=FadingBias([0.1, 0.1], 5.0))(turn),
+    "EKF with coloured noise": lambda turn: gaussian(EKF, sensor_error=FadingBias([0.1, 0.1], 5.0))(turn),
     "IEnKS": iterated,
     "particles": particles(),
     "particles, learned": particles(learned_likelihood),
     **{
-        f"{name} that {does}": around(make)
-        for does, around in {"heeds visibility": heeding, "doubts readings": contaminated}.items()
+        f"{name} with {model}": around(make)
+        for model, around in {"visibility": with_visibility, "outliers": contaminated}.items()
         for name, make in {
             "ensemble": ensemble(),
             "ensemble of samples": ensemble("sensor", "samples"),
@@ -284,7 +284,7 @@ FILTERS = {
 
 
 def turned_back(key, value, turn):
-    """Returns what was written at a turn, as it would be without."""
+    """Returns an entry of the rotated run, rotated back."""
     angle = {"mean", "ensemble", "past", "joint_mean", "past_mean"}
     if isinstance(key, tuple) and key[0] in ("belief", "smoothed") and key[-1] in angle:
         value = value.clone()
@@ -301,25 +301,25 @@ def written(filter, turn):
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_beliefs_turn_with_their_angles(name):
+def test_beliefs_rotate_with_their_angles(name):
     here, there = (written(FILTERS[name](turn), turn) for turn in (0.0, math.pi))
     data = frames(math.pi)["observation"][..., 0]
     assert data.min() < -3
     assert data.max() > 3
     assert here["belief", "mean"].isfinite().all()
-    for key, value in here.items():  # gains and factors on variances carry rounding on from step to step
+    for key, value in here.items():  # gains and variance factors accumulate rounding over the steps
         torch.testing.assert_close(there[key], value, rtol=1e-8, atol=1e-8, msg=lambda m, k=key: f"{k}: {m}")
 
 
 @pytest.mark.parametrize("parts", OF_ENSEMBLES)
-def test_a_gate_that_spreads_members_over_more_than_a_turn_takes_their_angles_for_numbers(parts):
-    """Headings near zero wrap nowhere: an analysis that does not know that they are angles is the oracle."""
+def test_gate_does_not_wrap_members_spread_over_more_than_a_turn(parts):
+    """The oracle is an analysis without angles, as headings near zero never wrap."""
     forecast = torch.tensor([0.4, 0.5]) * torch.randn(B, E, 2)
     entries = (
         {"ensemble": forecast, "observation": forecast},
         {"ensemble": torch.randn(B, 2), "noise": torch.ones(B, 2)},
     )
-    entries[1]["ensemble"][:, 1] += 20.0  # so far off that the gate rejected it long enough, and opens
+    entries[1]["ensemble"][:, 1] += 20.0  # a large innovation, at which the gate opens after `patience` rejections
     out = []
     for space in (PLANE, None):
         options = {"response": "reject", "window": 1, "adapt_inflation": 0.1, **OF_ENSEMBLES[parts]}
@@ -357,7 +357,7 @@ LOSSES = {
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_losses_do_not_turn(name):
+def test_losses_are_invariant_to_rotation(name):
     kind, make, options = LOSSES[name]
     values = []
     for turn in (0.0, math.pi):
@@ -368,29 +368,29 @@ def test_losses_do_not_turn(name):
         torch.testing.assert_close(values[1][key], value, rtol=1e-9, atol=1e-9, msg=lambda m, k=key: f"{k}: {m}")
 
 
-def know_of_spaces():
-    """The classes of modules that take the space of a reading, or that change entries which an analysis aligned."""
+def modules_with_spaces():
+    """Returns the classes of modules that take the space of a reading, or change entries that an analysis aligned."""
     found, root = set(), Path(torch_denkf.__file__).parent
     for file in sorted(root.rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ClassDef) and any(map(_speaks_of_spaces, ast.walk(node))):
+            if isinstance(node, ast.ClassDef) and any(map(_names_a_space, ast.walk(node))):
                 place = ".".join(["torch_denkf", *file.relative_to(root).with_suffix("").parts])
                 found.add(getattr(importlib.import_module(place), node.name))
-    # Readings of motions say which space they are in, and what rejects readings looks at each by itself.
+    # Measurement models of motions declare their space, and rejection handles each reading separately.
     others = ("torch_denkf.motions.", "torch_denkf.imperfect.rejection")
     return {kind for kind in found if issubclass(kind, nn.Module) and not kind.__module__.startswith(others)}
 
 
-def _speaks_of_spaces(node):
+def _names_a_space(node):
     words = {getattr(node, name, None) for name in ("arg", "attr", "id")}
     return bool(words & {"reading_space", "spaces", "aligned"})
 
 
-def test_every_module_that_knows_of_angles_is_turned():
+def test_every_module_with_angles_is_tested():
     made = [make(0.0) for make in FILTERS.values()] + [
         kind(make(0.0), **options) for kind, make, options in LOSSES.values()
     ]
     turned = {kind for each in made for part in each.modules() for kind in type(part).__mro__}
-    found = know_of_spaces()
+    found = modules_with_spaces()
     assert {EnsembleAnalysis, LearnedLikelihood} < found
     assert not found - turned, "add them to FILTERS or LOSSES"

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Built from a copy: setuptools writes build/ and *.egg-info beside the sources."""
+    """Built from a copy: setuptools writes build/ and *.egg-info next to the sources."""
     source = tmp_path_factory.mktemp("source")
     files = ["setup.py", "pyproject.toml", "README.md", "LICENSE", "torch_denkf", "modules", "tests", "benchmarks"]
     names = [name for name in [*files, "examples"] if (ROOT / name).exists()]
@@ -59,7 +59,7 @@ def test_the_wheel_holds_the_package_alone(wheel, tmp_path):
 
 
 def check_trained_filters(wheel, folder):
-    """They are small, and believe in a fresh process, from the wheel's own files, what they believe here."""
+    """Pretrained filters are small, and give the same belief from the wheel in a fresh process."""
     weights = [each for each in wheel.infolist() if "/weights/" in each.filename]
     assert sum(each.file_size for each in weights) <= 1.5e6
     names = torch_denkf.available()
@@ -78,7 +78,7 @@ def check_trained_filters(wheel, folder):
         assert found[name] == pytest.approx(values, rel=1e-4, abs=1e-5), name
 
 
-#: The rooms that every user needs; with them go the files at the package's top, but for the one that looks robots up.
+#: Packages of the core; the files at the package's top belong to it, except the one that looks up robots.
 CORE = ("functional", "metrics", "modules", "filters", "smoothers", "transforms", "objectives")
 ROBOTS = {
     name
@@ -145,7 +145,7 @@ print(json.dumps(found))
 """
 
 
-def test_what_an_import_costs():
+def test_import_time():
     done = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     assert found["functional"] == found["plots"] == []

@@ -1,4 +1,4 @@
-"""Keeps what torch keeps to itself in one room, so that a new torch can break no more than that."""
+"""Private names of torch are used in one package alone, so that a new version of torch can break only that one."""
 
 import ast
 from pathlib import Path
@@ -13,7 +13,7 @@ DOCUMENTED = {
 
 
 def private_names(path):
-    """Names of torch with a part that begins with one underscore."""
+    """Yields names of torch with a part that begins with one underscore."""
     for node in ast.walk(ast.parse(path.read_text())):
         names = []
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "torch":
@@ -30,7 +30,7 @@ def private_names(path):
                 yield name
 
 
-def test_private_names_of_torch_stand_in_the_passes_room_alone():
+def test_private_names_of_torch_are_used_in_compilation_only():
     found = {
         (str(path.relative_to(ROOT)), name)
         for path in ROOT.rglob("*.py")
@@ -39,4 +39,4 @@ def test_private_names_of_torch_stand_in_the_passes_room_alone():
         if not any(known.startswith(name) or name == known for known in DOCUMENTED)
     }
     assert not found
-    assert any(True for path in (ROOT / "compilation").glob("*.py") for _ in private_names(path)), "it looks"
+    assert any(True for path in (ROOT / "compilation").glob("*.py") for _ in private_names(path)), "found none"

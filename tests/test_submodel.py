@@ -69,13 +69,13 @@ every_sub_model = pytest.mark.parametrize("name", CASES)
 
 
 def plain(name):
-    """The sub-model with the keys that it has by default."""
+    """Returns the sub-model with the keys that it has by default."""
     kind, arguments, options, _ = CASES[name]
     return kind(*arguments(), **options)
 
 
 def names_of_keys(name):
-    """Every parameter that names an entry, and what it names by default."""
+    """Returns every parameter that names an entry, and what it names by default."""
     kind, _, options, _ = CASES[name]
     parameters = dict(inspect.signature(kind).parameters)
     if "options" in parameters:  # **options go to the class that it is made of
@@ -93,7 +93,7 @@ def other(parameter, value):
 
 
 def renamed(name):
-    """The sub-model with other names for all that it reads and writes."""
+    """Returns the sub-model with other names for all that it reads and writes."""
     kind, arguments, options, _ = CASES[name]
     names = {key: other(key, value) for key, value in names_of_keys(name).items()}
     return kind(*arguments(), **{**options, **names})
@@ -132,7 +132,7 @@ def test_every_name_is_that_of_its_parameter(name):
 
 @every_sub_model
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_it_writes_what_it_says_and_nothing_else(name, batch):
+def test_writes_its_out_keys_only(name, batch):
     module, td = make(name, batch)
     before = td.copy()
     out = module(td)

@@ -1,4 +1,4 @@
-"""One check of a constructor's arguments: names, keys, flags and functions, as their annotations say."""
+"""Checks constructor arguments by their annotations: names, keys, flags and functions."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ __all__ = ["Checked", "check_arguments", "check_key"]
 class Checked:
     """A class whose constructor checks its arguments by their annotations.
 
-    An argument that is annotated as a key, a list of keys, a flag or a function is one; an argument of another name is
-    an error. Numbers and tensors are checked by the constructors, which know their limits.
+    An argument that is annotated as a key, a list of keys, a flag or a function must be one; an unknown argument is an
+    error. Numbers and tensors are checked by the constructors, which know their limits.
 
     Example:
         >>> class Reader(Checked):
@@ -42,7 +42,7 @@ def check_arguments(owner: type, args: tuple, kwargs: Mapping[str, Any]) -> None
     """Raises unless a class can be called with these arguments.
 
     Raises:
-        TypeError: that names the class, the argument, and what it takes.
+        TypeError: names the class, the argument, and the expected kind of value.
     """
     signature, options, open_ended = _signature(owner)
     unknown = [name for name in kwargs if name not in signature.parameters and name not in options]
@@ -51,7 +51,7 @@ def check_arguments(owner: type, args: tuple, kwargs: Mapping[str, Any]) -> None
         raise TypeError(f"{owner.__name__} takes no argument {unknown[0]!r}; it takes {', '.join([*names, *options])}")
     try:
         bound = signature.bind_partial(*args, **kwargs).arguments
-    except TypeError:  # Python's own words name the class
+    except TypeError:  # Python's own message names the class
         return
     for name, value in bound.items():
         parameter = signature.parameters[name]
@@ -66,7 +66,7 @@ def check_key(name: str, key: Any) -> None:
     """Raises unless ``key`` names an entry of a tensordict: a string, or a tuple of them, not empty.
 
     Raises:
-        TypeError: that names the argument.
+        TypeError: names the argument.
     """
     if not _is_key(key):
         raise TypeError(f"{name} is a key, a string or a tuple of strings; got {key!r}")
@@ -77,7 +77,7 @@ _VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 @cache
 def _signature(owner: type) -> tuple[inspect.Signature, dict[str, str], bool]:
-    """Returns the signature without ``self``; what ``**options`` hold, by name; and whether these may be anything."""
+    """Returns the signature without ``self``, the names in ``**options``, and whether other names are allowed."""
     function = inspect.unwrap(getattr(owner, "__init__"))  # noqa: B009  # mypy distrusts it on a type
     signature = inspect.signature(function)
     parameters = list(signature.parameters.values())[1:]
@@ -94,7 +94,7 @@ def _signature(owner: type) -> tuple[inspect.Signature, dict[str, str], bool]:
 
 
 def _of_bases(owner: type) -> dict[str, str]:
-    """Returns the arguments of the next class, to which ``**kwargs`` are handed on, by name."""
+    """Returns the arguments of the next base class, which receives ``**kwargs``, by name."""
     for base in owner.__mro__[1:]:
         if "__init__" in base.__dict__ and Checked in base.__mro__:
             signature, options, _ = _signature(base)
@@ -103,7 +103,7 @@ def _of_bases(owner: type) -> dict[str, str]:
 
 
 def _fields(kind: type) -> Iterator[tuple[str, str]]:
-    """Names and annotations of a TypedDict, as text."""
+    """Returns names and annotations of a TypedDict, as text."""
     for name, annotation in kind.__annotations__.items():
         yield name, getattr(annotation, "__forward_arg__", str(annotation))
 
@@ -136,7 +136,7 @@ def _are_keys(value: Any) -> bool:
 
 
 _FUNCTION: tuple[Callable[[Any], bool], str] = (callable, "a function")
-#: What is checked, by its annotation: whether a value fits, and what it must be in words.
+#: The checks by annotation: a test of the value, and the expected kind in words.
 _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "NestedKey": (_is_key, "a key, a string or a tuple of strings"),
     "Sequence[NestedKey]": (_are_keys, "a list of keys, each a string or a tuple of strings"),

@@ -1,8 +1,8 @@
-"""Checks of what comes in at the borders: the message names the argument and its value, and says what to pass.
+"""Checks of arguments from outside: the message names the argument and its value, and says what to pass.
 
-There are three kinds. Shapes and dtypes are known without looking at a tensor's values, so that functions check them
-wherever they run, also under ``torch.compile``. Numbers and constants are checked by constructors, which see their
-values. Text is checked by readers, which add the file and the line.
+There are three kinds. Shapes and dtypes are known without a tensor's values, so functions check them everywhere, also
+under ``torch.compile``. Numbers and constants are checked by constructors, which see their values. Text is checked by
+readers, which add the file and the line.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def check_ensemble(name: str, ensemble: Tensor, min_size: int = 1) -> None:
     Args:
         name: the argument's name, for the message.
         ensemble: the argument.
-        min_size: the fewest members that make sense.
+        min_size: the smallest size allowed.
 
     Raises:
         ValueError: if there are too few dimensions or members.
@@ -87,7 +87,7 @@ def check_one_dtype(**tensors: Tensor | None) -> None:
     """Raises unless all tensors have the dtype of the first.
 
     Args:
-        **tensors: the arguments by name; ``None`` is passed over.
+        **tensors: the arguments by name; ``None`` is skipped.
 
     Raises:
         TypeError: if two differ.
@@ -144,16 +144,16 @@ def check_number(
     most: float | None = None,
     cure: str = "",
 ) -> None:
-    """Raises unless ``value`` is a finite number within limits; a tensor, if all of its values are.
+    """Raises unless ``value`` is a finite number within limits; of a tensor, all values must be.
 
     Args:
         name: the argument's name, for the message.
         value: the argument.
-        above: what it must be larger than.
-        least: its smallest value.
-        below: what it must be smaller than.
-        most: its largest value.
-        cure: what to do, as an end of the message.
+        above: exclusive lower limit.
+        least: inclusive lower limit.
+        below: exclusive upper limit.
+        most: inclusive upper limit.
+        cure: advice, appended to the message.
 
     Raises:
         TypeError: if it is no number.
@@ -175,7 +175,7 @@ def check_number(
 
 
 def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None, cure: str = "") -> None:
-    """Raises unless ``value`` is a whole number, at least so large, and at most so large where ``most`` says so.
+    """Raises unless ``value`` is a whole number, at least ``least``, and at most ``most`` if that is given.
 
     Raises:
         TypeError: if it is no whole number.
@@ -222,20 +222,20 @@ def check_values(
     infinite: bool = False,
     cure: str = "",
 ) -> None:
-    """Raises unless all values of a constant are finite and within limits; one without values, on "meta", passes.
+    """Raises unless all values of a constant are finite and within limits; a tensor on "meta" passes.
 
     Args:
         name: the argument's name, for the message.
         tensor: the argument.
-        above: what the values must be larger than.
-        least: their smallest value.
-        below: what they must be smaller than.
-        most: their largest value.
-        infinite: whether infinity will do.
-        cure: what to do, as an end of the message.
+        above: exclusive lower limit.
+        least: inclusive lower limit.
+        below: exclusive upper limit.
+        most: inclusive upper limit.
+        infinite: whether infinity is allowed.
+        cure: advice, appended to the message.
 
     Raises:
-        ValueError: if one is not; the message has its index.
+        ValueError: if a value fails; the message has its index.
     """
     if not _has_values(tensor):
         return
@@ -253,7 +253,7 @@ def check_values(
 
 
 def check_square(name: str, matrix: Tensor, size: int | None = None, layout: str = "[S, S]") -> None:
-    """Raises unless ``matrix`` is square, and of ``size`` where that is given.
+    """Raises unless ``matrix`` is square, and of ``size`` if that is given.
 
     Raises:
         ValueError: if it is not.
@@ -267,16 +267,16 @@ def check_square(name: str, matrix: Tensor, size: int | None = None, layout: str
 def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: str = "[S, S]") -> None:
     """Raises unless a constant is a covariance: square, finite, symmetric and positive semi-definite, up to rounding.
 
-    What is tested are the correlations, so that metres and milliradians count alike.
+    Correlations are tested, so that the units of the components do not matter.
 
     Args:
         name: the argument's name, for the message.
         cov: the argument, ``[N, N]``.
-        size: N, where it is known.
+        size: N, if it is known.
         layout: the shape in words.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if it is no covariance.
 
     Example:
         >>> check_covariance("cov", torch.tensor([[1.0, 2.0], [2.0, 1.0]]))
@@ -287,7 +287,7 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
     if cov.ndim == 1:
         raise ValueError(
             f"{name} must be a covariance {layout}, got {list(cov.shape)}; "
-            "that of standard deviations is torch.diag(std**2)"
+            "for standard deviations pass torch.diag(std**2)"
         )
     check_square(name, cov, size, layout)
     check_values(name, cov)
@@ -319,7 +319,7 @@ def check_covariance(name: str, cov: Tensor, size: int | None = None, layout: st
 
 
 def has_values(tensor: Tensor) -> bool:
-    """Tells whether a tensor's values can be read: not on "meta", of a fake tensor, under vmap, or in a traced graph.
+    """Tells whether a tensor's values can be read: not on "meta", in a fake tensor, under vmap, or in a traced graph.
 
     Example:
         >>> has_values(torch.ones(2)), has_values(torch.ones(2, device="meta"))
@@ -335,12 +335,12 @@ def flag_value(flag: Tensor) -> bool | None:
         >>> flag_value(torch.tensor(True)), flag_value(torch.tensor(True, device="meta"))
         (True, None)
     """
-    # In a graph that is being captured a read is an error.
+    # Reading a value during graph capture is an error.
     if torch.compiler.is_compiling() or flag.is_meta or (flag.is_cuda and torch.cuda.is_current_stream_capturing()):
         return None
     try:
         return bool(flag)
-    except RuntimeError:  # what vmap and fake tensors say to it; the flag itself was made outside of this
+    except RuntimeError:  # raised by vmap and fake tensors
         return None
 
 
@@ -350,7 +350,7 @@ def _has_values(tensor: Tensor) -> bool:
 
 
 def _kept(value: Any, *limits: float | None) -> list[Any]:
-    """Tells which limits a number keeps, or each of a tensor's; they are those of :func:`check_number`, in order."""
+    """Tells which limits a number or each value of a tensor keeps; limits in the order of :func:`check_number`."""
     compare = (operator.gt, operator.ge, operator.lt, operator.le)
     return [kept(value, limit) for kept, limit in zip(compare, limits, strict=True) if limit is not None]
 

@@ -1,8 +1,8 @@
-"""Look-up by name of what outer rings register with inner ones, which import nothing of theirs.
+"""Look-up of outer modules that inner ones use by name, without importing them directly.
 
 A folder of ``torch_denkf.applications`` has a file ``registered.py`` with ``BUILDERS`` and ``COMMANDS``, and weights in
-``weights/NAME/``. Nothing else of the library knows an application. The kit's rooms that a filter uses by default
-are here, too: ``diagnosis`` and ``compilation``.
+``weights/NAME/``. No other module depends on an application. ``diagnosis`` and ``compilation``, which a filter uses by
+default, are looked up here, too.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def _all() -> Iterator[ModuleType]:
 
 
 def builders() -> dict[str, Callable[..., Any]]:
-    """Functions that build filters from plain numbers, by the name that a folder's ``config.json`` says."""
+    """Returns functions that build filters from plain numbers, by their name in ``config.json``."""
     return {name: resolve_name(place) for each in _all() for name, place in each.BUILDERS.items()}
 
 
@@ -36,22 +36,22 @@ def commands() -> dict[str, tuple[str, str]]:
 
 
 def compiler() -> ModuleType:
-    """Returns the room of torch's compiler; importing inductor itself, which it does later, takes half a second."""
+    """Returns the module that calls torch's compiler; it imports inductor, which takes half a second, on first use."""
     return import_module("torch_denkf.compilation")
 
 
 def deployment() -> ModuleType:
-    """Returns the room of packaged steps."""
+    """Returns the module of packaged steps."""
     return import_module("torch_denkf.deployment")
 
 
 def diagnosis() -> ModuleType:
-    """Returns the room of a filter's default observers."""
+    """Returns the module of a filter's default observers."""
     return import_module("torch_denkf.diagnosis")
 
 
 def primers() -> ModuleType:
-    """Returns the room of torchrl's transforms, which stands on the filters."""
+    """Returns the module of torchrl's transforms, which depends on the filters."""
     return import_module("torch_denkf.transforms")
 
 

@@ -1,4 +1,4 @@
-"""Beginnings of sequences in data: marks of episodes and slices, and slices that lie end to end."""
+"""First elements of sequences in data: marks of episodes and slices, and splitting of concatenated slices."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from torch import Tensor
 
 __all__ = ["as_rows", "device_of", "one_earlier", "starts_of"]
 
-#: What marks the last element of an episode.
+#: Entries that mark the last element of an episode.
 _ENDS = ("done", "truncated")
 
 
 def starts_of(tensordict: TensorDictBase, init_key: NestedKey, *, step: bool = False) -> Tensor | None:
-    """Marks the first elements of episodes or slices, ``[*B, T, 1]``; ``None`` where nothing says.
+    """Marks the first elements of episodes or slices, ``[*B, T, 1]``; ``None`` without any mark.
 
-    An element is a first one where ``is_init`` says so, and after one with a ``done`` at its root, as in the ``"next"``
-    part of data, which torchrl's losses filter, too. Where there is no ``is_init``, after one that is done next.
-    ``"truncated"`` counts like ``"done"``, and marks in groups of agents like those at the root.
+    An element is a first one if ``is_init`` marks it, or if the element before has a ``done`` at its root, as in the
+    ``"next"`` part of data, which torchrl's losses filter, too. Without ``is_init``, it is also a first one if the
+    element before has a ``done`` under ``"next"``. ``"truncated"`` counts like ``"done"``, and marks in groups of
+    agents like those at the root.
 
     Args:
         tensordict: ``[*B, T]``.
-        init_key: the mark.
-        step: whether ``tensordict`` is one step ``[*B]``, of which ``is_init`` alone says something.
+        init_key: key of the mark ``is_init``.
+        step: whether ``tensordict`` is one step ``[*B]``, for which only ``is_init`` counts.
     """
     if step:
         return _marks(tensordict, tensordict, init_key)[0]
@@ -38,13 +39,13 @@ def starts_of(tensordict: TensorDictBase, init_key: NestedKey, *, step: bool = F
 
 
 def device_of(tensordict: TensorDictBase) -> torch.device | None:
-    """Returns the device of a tensordict, or that of what is in it, where it has none of its own."""
+    """Returns the device of a tensordict, or of its first tensor if the tensordict has none."""
     found = (value.device for value in tensordict.values(True, True) if isinstance(value, Tensor))
     return tensordict.device or next(found, None)
 
 
 def as_rows(tensordict: TensorDictBase, new: Tensor | None) -> tuple[TensorDictBase, Tensor | None]:
-    """Slices of one length in a flat ``[N]`` as ``[N / L, L]``; anything else as it is."""
+    """Returns slices of equal length in a flat ``[N]`` as ``[N / L, L]``; other data unchanged."""
     if tensordict.ndim != 1 or new is None or torch.compiler.is_compiling():
         return tensordict, new
     size, marks = tensordict.batch_size[0], new.reshape(-1).cpu()  # waits for the device once
@@ -57,7 +58,7 @@ def as_rows(tensordict: TensorDictBase, new: Tensor | None) -> tuple[TensorDictB
 
 
 def one_earlier(value: Tensor, time: int) -> Tensor:
-    """Returns every element from one step before; the first stays where it is."""
+    """Shifts elements by one step to later times; the first element is repeated."""
     count = value.shape[time]
     return torch.cat([value.narrow(time, 0, 1), value.narrow(time, 0, count - 1)], time)
 
@@ -67,7 +68,7 @@ def _either(first: Tensor | None, second: Tensor | None) -> Tensor | None:
 
 
 def _marks(source: TensorDictBase, tensordict: TensorDictBase, *keys: NestedKey) -> list[Tensor | None]:
-    """Marks ``[*B, T, 1]``: each that of the root, or of any agent in any group."""
+    """Returns marks ``[*B, T, 1]`` for each key: the root's, or whether any agent in any group is marked."""
     values = [source.get(key, None) for key in keys]
     nested = []
     if any(value is None for value in values):

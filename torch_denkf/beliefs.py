@@ -1,6 +1,6 @@
-"""Kinds of belief: which entries each carries from step to step, what follows from them, and how they are limited.
+"""Kinds of belief: their carried entries, the entries computed from these, and limits on their variances.
 
-A kind is one class. A new one is a sub-class of :class:`Belief`, which is found by the names that it carries::
+A kind is a sub-class of :class:`Belief`, which is found by the names of its carried entries::
 
     class Mixture(Belief):
         carried = ("means", "covs", "log_weights")
@@ -37,7 +37,7 @@ __all__ = [
     "summary_keys",
 ]
 
-#: The mean is clamped within so many of the largest standard deviations that a variance ceiling allows.
+#: The mean is clamped to this many standard deviations at the variance ceiling.
 _FARTHEST = 1000.0
 _SUMMARIES = ("mean", "var")
 
@@ -45,7 +45,7 @@ _SUMMARIES = ("mean", "var")
 def moments_of(
     ensemble: Tensor, log_weights: Tensor | None = None, space: Space | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Returns the mean of members ``[*B, E, S]``, and their variances; on a space those of their tangents there."""
+    """Returns mean and variances of members ``[*B, E, S]``; on a space the variances are of tangents at the mean."""
     if space is not None:
         mean = space.mean(ensemble, None if log_weights is None else log_weights.exp())
         away = space.minus(ensemble, mean.unsqueeze(-2))
@@ -57,15 +57,15 @@ def moments_of(
 
 
 class Belief:
-    """A belief whose entries stand under one prefix; as it is, one of no known kind.
+    """A belief whose entries are stored under one prefix; the base class stands for an unknown kind.
 
     Args:
-        prefix: of its entries, ``("belief",)`` for example.
-        space: in which the state lives; ``None`` for plain numbers.
+        prefix: first part of its keys, ``("belief",)`` for example.
+        space: space of the state; ``None`` for plain numbers.
 
     Attributes:
-        carried: names of the entries that go on from step to step; the first holds points of the state's space.
-        carry: their keys.
+        carried: names of the entries that continue from step to step; the first contains points of the state's space.
+        carry: keys of these entries.
 
     Example:
         >>> kind, = kinds_of([("belief", "mean"), ("belief", "cov"), ("belief", "var")])
@@ -94,7 +94,7 @@ class Belief:
         return (*self.prefix, name)
 
     def derived(self, name: str, *carried: Tensor) -> Tensor | None:
-        """Computes an entry that is not carried, ``"mean"`` or ``"var"``; ``None`` where it does not follow."""
+        """Computes an entry that is not carried, ``"mean"`` or ``"var"``; ``None`` if it cannot be computed."""
         return None
 
     def finite(self, name: str, value: Tensor) -> Tensor:
@@ -102,18 +102,18 @@ class Belief:
         return value.isfinite().all()
 
     def flaws(self, entries: Mapping[NestedKey, Tensor]) -> list[str]:
-        """Names what is wrong with a belief whose numbers are finite."""
+        """Names the defects of a belief whose values are finite."""
         return []
 
     def limited(self, held: Mapping[str, Tensor], ceiling: float) -> dict[str, Tensor]:
-        """Clamps variances to a ceiling; correlations stay, and the mean stays within reach of zero.
+        """Clamps variances to a ceiling, and the mean to a range around zero; correlations are kept.
 
         Args:
-            held: the belief's entries by name, ``"mean"`` and ``"var"`` among them.
+            held: the belief's entries by name, including ``"mean"`` and ``"var"``.
             ceiling: largest variance, in the state's units squared.
 
         Returns:
-            The entries that change.
+            The changed entries.
         """
         out = {"mean": self._within_reach(held["mean"], ceiling), "var": held["var"].clamp(max=ceiling)}
         if "cov" in held:
@@ -122,7 +122,7 @@ class Belief:
         return out
 
     def _factor(self, held: Mapping[str, Tensor], ceiling: float) -> Tensor:
-        return (held["var"].detach() / ceiling).clamp(min=1).rsqrt()  # a constant to the gradient
+        return (held["var"].detach() / ceiling).clamp(min=1).rsqrt()  # no gradient through the factor
 
     def _within_reach(self, mean: Tensor, ceiling: float) -> Tensor:
         farthest = _FARTHEST * sqrt(ceiling)
@@ -148,7 +148,7 @@ class Moments(Belief):
 
 
 class Ensemble(Belief):
-    """Members of one weight, ``[*B, E, S]``."""
+    """Members of equal weight, ``[*B, E, S]``."""
 
     carried = ("ensemble",)
 
@@ -162,17 +162,17 @@ class Ensemble(Belief):
         return None if sample is None else sample(ensemble)
 
     def limited(self, held, ceiling):
-        """Moves the members with their mean and variances; where nothing is clamped, not even by rounding."""
+        """Scales and shifts the members to the clamped moments; rows within the ceiling keep their exact values."""
         out, ensemble, mean = super().limited(held, ceiling), held["ensemble"], held["mean"].unsqueeze(-2)
         factor, now = self._factor(held, ceiling).unsqueeze(-2), out["mean"].unsqueeze(-2)
-        if self.space is None:  # a factor of one leaves all digits
+        if self.space is None:  # exact for a factor of one
             return {**out, "ensemble": torch.lerp(now, ensemble - (mean - now), factor)}
         moved = self.space.plus(mean, self.space.minus(ensemble, mean) * factor)
         return {**out, "ensemble": torch.where((factor == 1).all(-1, keepdim=True), ensemble, moved)}
 
 
 class Particles(Belief):
-    """Weighted particles: points ``[*B, E, S]`` and log-weights ``[*B, E]``, of which ``-inf`` is one of no weight."""
+    """Weighted particles: points ``[*B, E, S]`` and log-weights ``[*B, E]``; ``-inf`` is a weight of zero."""
 
     carried = ("ensemble", "log_weight")
 
@@ -186,9 +186,9 @@ class Particles(Belief):
         return (value < torch.inf).all() if name == "log_weight" else super().finite(name, value)
 
     def limited(self, held, ceiling):
-        """Moves those particles alone that make the variance too large, near the weighted median.
+        """Moves only the particles that make the variance too large, to the weighted median plus or minus the limit.
 
-        The others are what is known, and an observation will tell. On a space particles stay.
+        The others keep what is known, for the next observation. On a space no particle is moved.
         """
         out = {"var": held["var"].clamp(max=ceiling)}
         if self.space is not None:
@@ -204,12 +204,12 @@ class Particles(Belief):
 def kinds_of(
     keys: Iterable[NestedKey], space: Space | None = None, carry: Collection[NestedKey] = ()
 ) -> tuple[Belief, ...]:
-    """Returns the kinds of the beliefs that keys are entries of, one for each prefix.
+    """Returns the kinds of the beliefs to which keys belong, one for each prefix.
 
     Args:
-        keys: of entries of beliefs.
-        space: in which the state lives; ``None`` for plain numbers.
-        carry: those that go on from step to step, which alone tell the kind where a prefix has any.
+        keys: keys of entries of beliefs.
+        space: space of the state; ``None`` for plain numbers.
+        carry: keys that continue from step to step; if a prefix has any, they alone determine its kind.
     """
     groups: dict[tuple[str, ...], list[NestedKey]] = {}
     for key in keys:
@@ -224,17 +224,17 @@ def kinds_of(
 
 
 def is_summary(key: NestedKey) -> bool:
-    """Tells whether an entry of a belief is small whatever the number of members: mean, variances, an age."""
+    """Tells whether the size of a belief's entry is independent of the number of members: mean, variances, an age."""
     return not isinstance(key, str) and key[-1] in (*_SUMMARIES, "age")
 
 
 def is_samples(key: NestedKey) -> bool:
-    """Tells whether an entry holds samples by its name, such as ``("sensor", "ensemble")``."""
+    """Tells by its name whether an entry contains samples, such as ``("sensor", "ensemble")``."""
     return not isinstance(key, str) and key[-1] in Ensemble.carried
 
 
 def summary_keys(carry: Collection[NestedKey], written: Iterable[NestedKey]) -> list[NestedKey]:
-    """Returns the moments among ``written`` keys that stand next to an entry that is carried."""
+    """Returns the moments among ``written`` keys that have the same prefix as a carried entry."""
     prefixes = {key[:-1] for key in carry if not isinstance(key, str)}
     moments = (*_SUMMARIES, "cov")
     return [key for key in written if not isinstance(key, str) and key[:-1] in prefixes and key[-1] in moments]
@@ -246,16 +246,16 @@ def complete(
     kinds: Iterable[Belief],
     stored: Mapping[NestedKey, Tensor] | None = None,
 ) -> dict[NestedKey, Tensor]:
-    """Returns the entries with those of the belief that are missing and follow from them.
+    """Adds the missing entries of the belief that can be computed from the carried ones.
 
     Args:
-        entries: those that are carried, and others.
+        entries: the carried entries, and others.
         belief: keys of the belief.
-        kinds: of its prefixes.
-        stored: where an entry is looked for that does not follow.
+        kinds: kinds of belief of the prefixes.
+        stored: source of entries that cannot be computed.
 
     Raises:
-        KeyError: if an entry neither follows nor is stored.
+        KeyError: if an entry can neither be computed nor is stored.
     """
     out = dict(entries)
     for key in belief:
@@ -269,8 +269,8 @@ def complete(
             value = stored.get(key)
         if value is None:
             raise KeyError(
-                f"{key!r} does not follow from {list(entries)}: let the initial belief write it, or store it with the "
-                "belief."
+                f"{key!r} cannot be computed from {list(entries)}: let the initial belief write it, or store it with "
+                "the belief."
             )
         out[key] = value
     return out

@@ -1,4 +1,4 @@
-"""Any TensorDict module: how it runs on entries, what it reads and writes, and which of its parts draw noise."""
+"""Functions on any TensorDict module: run it on entries, list its inputs and outputs, and its parts that draw noise."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def check_module(name: str, module: Any) -> None:
     """Raises unless an argument is a TensorDict module.
 
     Raises:
-        TypeError: if it is none; ``name`` is the argument's.
+        TypeError: if it is none; the message has ``name``, the argument's name.
     """
     if not (isinstance(module, nn.Module) and hasattr(module, "in_keys") and hasattr(module, "out_keys")):
         made_of = name in ("transition", "observation") and callable(module)
@@ -49,10 +49,10 @@ def check_module(name: str, module: Any) -> None:
 
 
 def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> Entries:
-    """Runs a module on entries, and returns what it writes: a sub-model, a sequence, or any TensorDict module.
+    """Runs a module on entries, and returns its outputs: a sub-model, a sequence, or any TensorDict module.
 
-    Another TensorDict module gets a TensorDict of what it names among its keys, so it sees the same in a step as in a
-    sequence. So does a sub-model with a ``forward`` of its own, or with forward hooks.
+    Another TensorDict module gets a TensorDict of its own keys only, so that a step and a sequence are alike to it. So
+    does a sub-model that overrides ``forward``, or has forward hooks.
     """
     if runs_as_written(module):
         return _explained(module.on_entries, module, entries, call)
@@ -80,15 +80,15 @@ def run_module(module: TensorDictModuleBase, entries: Entries, call: Call) -> En
 def linearise(
     module: TensorDictModuleBase, entries: Entries, call: Call
 ) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
-    """Returns what a module says of itself, see :meth:`SubModel.linearised`; ``None`` where only autograd knows."""
+    """Returns a module's declared linearisation, see :meth:`SubModel.linearised`; ``None`` selects autograd."""
     try:
         return _explained(module.linearised, module, entries, call) if runs_as_written(module) else None
-    except NotImplementedError:  # a motion, or a measurement, without its optional gradient
+    except NotImplementedError:  # a motion or a measurement without a gradient
         return None
 
 
 def runs_as_written(module: TensorDictModuleBase) -> TypeGuard[SubModel]:
-    """Tells whether a module is a sub-model, with neither forward hooks nor a ``forward`` of its own."""
+    """Tells whether a module is a sub-model that has no forward hooks and does not override ``forward``."""
     return type(module).forward is SubModel.forward and not (module._forward_hooks or module._forward_pre_hooks)
 
 
@@ -102,7 +102,7 @@ def _explained(method: Callable[[Entries, Call], T], module: SubModel, entries: 
 
 
 def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: Entries, call: Call) -> Entries:
-    """Runs named modules one after the other, and returns what they write."""
+    """Runs named modules one after the other, and returns their outputs."""
     entries, written = dict(entries), {}
     for name, module in modules:
         out = run_module(module, entries, call.part(name))
@@ -112,20 +112,20 @@ def run_modules(modules: Iterable[tuple[str, TensorDictModuleBase]], entries: En
 
 
 def is_sequence(module: Any) -> TypeGuard[TensorDictSequential]:
-    """Tells whether a module is a plain sequence of others, and not a filter, for example.
+    """Tells whether a module is a plain sequence of others; a filter, for example, is not.
 
-    Torch's tracer shows modules as objects of a class of its own, which inherits theirs: their type alone says nothing.
+    Torch's tracer wraps modules in a class of its own that inherits from theirs, so the type alone is not enough.
     """
     return isinstance(module, TensorDictSequential) and type(module).forward is TensorDictSequential.forward
 
 
 def named_modules_of(sequence: TensorDictSequential) -> list[tuple[str, TensorDictModuleBase]]:
-    """Returns the modules of a sequence and their names, which are numbers unless it was made of a dictionary."""
+    """Returns the modules of a sequence with their names, which are numbers unless it was made of a dictionary."""
     return list(sequence.module._modules.items())
 
 
 def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey]]:
-    """Returns the keys that a module must find, and those that it uses where they are there."""
+    """Returns the required keys of a module, and its optional ones."""
     if not is_sequence(module):
         may = [unravel_key(key) for key in getattr(module, "optional_keys", ())]
         must = [key for key in map(unravel_key, module.in_keys) if key not in may]
@@ -134,7 +134,7 @@ def reads(module: TensorDictModuleBase) -> tuple[list[NestedKey], list[NestedKey
 
 
 def reads_of(modules: Iterable[TensorDictModuleBase]) -> tuple[list[NestedKey], list[NestedKey]]:
-    """Returns the keys that modules, one after the other, must find, and those that they use where they are there."""
+    """Returns the required and the optional keys of modules that run one after the other."""
     needed: dict[NestedKey, None] = {}
     optional: dict[NestedKey, None] = {}
     made: set[NestedKey] = set()
@@ -147,12 +147,12 @@ def reads_of(modules: Iterable[TensorDictModuleBase]) -> tuple[list[NestedKey], 
 
 
 def writes(module: TensorDictModuleBase) -> list[NestedKey]:
-    """Returns the keys that a module writes; of a plain sequence those that its modules write now."""
+    """Returns the keys that a module writes; for a plain sequence those that its modules currently write."""
     return list(dict.fromkeys(unravel_key(key) for part in in_sequences(module) for key in part.out_keys))
 
 
 def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
-    """Yields the module, or those of a plain sequence."""
+    """Yields the module, or the modules of a plain sequence."""
     if is_sequence(module):
         for _, part in named_modules_of(module):
             yield from in_sequences(part)
@@ -161,18 +161,18 @@ def in_sequences(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]
 
 
 def reading_of(sensor: TensorDictModuleBase) -> NestedKey:
-    """Returns the key of a sensor's reading: the first that the last of its modules writes that makes one."""
+    """Returns the key of a sensor's reading: the first output of its last module that makes a reading."""
     *_, last = (part for part in in_sequences(sensor) if not role(part, Sensor).judges_reading)
     return writes(last)[0]
 
 
 def marks_of(module: TensorDictModuleBase) -> dict[NestedKey, NestedKey]:
-    """Maps each mask that a module derives, for readings that it finds missing, to the mask that it derives it from."""
+    """Maps each mask that the module writes, which also marks readings it finds missing, to the given mask."""
     return {made: given for part in in_sequences(module) for made, given in role(part, Sensor).marks.items()}
 
 
 def random_parts(module: TensorDictModuleBase, place: str) -> Iterator[tuple[str, SubModel]]:
-    """Yields the sub-models that draw noise, and their places, in the order in which they run."""
+    """Yields the sub-models that draw noise, with their places, in the order in which they run."""
     parts: Iterable[tuple[str, TensorDictModuleBase]]
     if isinstance(module, SubModel):
         if module.noise_names:

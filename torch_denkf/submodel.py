@@ -1,6 +1,6 @@
-"""A filter's parts, functions of tensors with names for what they read and write, and the roles that they have.
+"""Parts of a filter: functions of tensors with keys of their inputs and outputs, and their roles.
 
-Each part is a :class:`SubModel`. What a filter must know of it in its role it declares as a :class:`Sensor`, an
+Each part is a :class:`SubModel`. Its role declares further properties for the filter: a :class:`Sensor`, an
 :class:`Initial` belief, a :class:`Transition` or an :class:`Update`.
 """
 
@@ -25,11 +25,11 @@ __all__ = ["Call", "Entries", "Initial", "Noise", "Sensor", "SubModel", "Transit
 
 R = TypeVar("R", bound="SubModel")
 
-#: The methods that decide what a sub-model computes, and those that know its Jacobian.
+#: Methods that determine what a sub-model computes, and methods that give its Jacobian.
 _COMPUTES = frozenset({"compute", "on_entries", "forward", "observe", "move", "features", "_run"})
 _JACOBIANS = frozenset({"jacobian", "linearised", "gradient", "move_and_gradient"})
 
-#: Tensors by unravelled key: what a step of a filter works on.
+#: Tensors by unravelled key, on which a step of a filter works.
 Entries: TypeAlias = dict[NestedKey, Tensor]
 #: The noise of one call of a sub-model: one tensor, several by name, or ``None`` for the deterministic forward.
 Noise: TypeAlias = "Tensor | Mapping[str, Tensor] | None"
@@ -40,10 +40,10 @@ class Call(NamedTuple):
 
     Attributes:
         batch_size: ``[*B]``, in front of every entry.
-        place: where the module stands in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
+        place: the module's place in the filter, e.g. ``"transition"``; its noise is ``("noise", place)``.
         sample: whether random modules draw; if not, they run their deterministic forward.
         time: whether the last dimension of ``batch_size`` is time.
-        raw: whether process noise is added as it is given; who calls has made it exact.
+        raw: whether process noise is added as it is given, because the caller has made its moments exact.
     """
 
     batch_size: torch.Size
@@ -58,7 +58,7 @@ class Call(NamedTuple):
 
 
 def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
-    """Returns noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` where it is several tensors."""
+    """Returns noise as entries ``("noise", *place)``, or ``("noise", *place, name)`` if there are several tensors."""
     if noise is None:
         return {}
     if isinstance(noise, Tensor):
@@ -70,18 +70,18 @@ def flat_noise(noise: Noise | TensorDictBase, *place: str) -> Entries:
 
 
 class SubModel(Checked, TensorDictModule):
-    """A part of a filter: a function of tensors, and the keys of what it reads and writes.
+    """A part of a filter: a function of tensors, with the keys of its inputs and outputs.
 
     A sub-class declares its keys in ``__init__`` and implements :meth:`compute`. Called on a TensorDict it reads and
-    writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead: it costs less.
-    Noise that it finds there is used instead of fresh noise: in a filter under ``("noise", place)``, by itself under
-    ``("noise", "self")``.
+    writes there like any TensorDict module; a filter calls :meth:`on_entries` on a dictionary instead, which is faster.
+    Noise in the input is used instead of fresh noise: in a filter under ``("noise", place)``, for a sub-model alone
+    under ``("noise", "self")``.
 
     Args:
-        network: the module that holds the parameters; ``torch.nn.Identity()`` if there is none.
-        in_keys: entries that must be there.
-        out_keys: entries that are written.
-        optional_keys: entries that are used where they are there.
+        network: the module with the parameters; ``torch.nn.Identity()`` if there is none.
+        in_keys: required inputs.
+        out_keys: outputs.
+        optional_keys: inputs that may be missing.
 
     Attributes:
         noise_names: names of the tensors that :meth:`draw_noise` draws: ``()`` for a deterministic sub-model, ``("",)``
@@ -113,10 +113,10 @@ class SubModel(Checked, TensorDictModule):
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
-        # tensordict wraps every __init__ and so must come first; what compute asks for is looked up once a class.
+        # tensordict wraps every __init__ and so must come first; the signature of compute is read once per class.
         cls._wants = frozenset({"noise", "batch_size"} & inspect.signature(cls.compute).parameters.keys())
         if is_older(cls, _JACOBIANS, _COMPUTES):
-            # What is inherited is that of another function.
+            # The inherited Jacobian is that of another function.
             cls.jacobian, cls.linearised = SubModel.jacobian, SubModel.linearised  # type: ignore[method-assign]
 
     def __init__(
@@ -131,37 +131,38 @@ class SubModel(Checked, TensorDictModule):
         required = set(map(unravel_key, self.in_keys))
         self.optional_keys = [key for key in dict.fromkeys(map(unravel_key, optional_keys)) if key not in required]
 
-    # Unlike TensorDictModule, show no attributes of the network: its "loc" or "scale" would hide our buffers.
+    # Unlike TensorDictModule, show no attributes of the network: its "loc" or "scale" would shadow our buffers.
     __getattr__ = nn.Module.__getattr__
 
     def compute(self, *values: Any, **_: Any) -> Tensor | tuple[Tensor, ...]:
-        """Computes one tensor for each of ``out_keys``, or a tensor alone if that is one.
+        """Computes one tensor for each of ``out_keys``; a single output may be a bare tensor.
 
         Args:
-            *values: the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+            *values: the entries of ``in_keys``, then those of ``optional_keys``, ``None`` for a missing one.
             **_: a sub-class may ask for ``batch_size``, the ``[*B]`` in front of every entry, and, if it has
-                ``noise_names``, for ``noise``: what :meth:`draw_noise` drew, or ``None`` for the deterministic forward.
+                ``noise_names``, for ``noise``: the result of :meth:`draw_noise`, or ``None`` for the deterministic
+                forward.
         """
         raise TypeError(f"{type(self).__name__} has no compute(): write it, see SubModel.")
 
     def jacobian(self, *values: Any) -> tuple[Tensor, Tensor] | None:
-        """Returns what :meth:`compute` does without noise, and its Jacobian by what it reads first, if it is known.
+        """Returns the result of :meth:`compute` without noise, and its Jacobian by the first input, if known.
 
-        Otherwise automatic differentiation finds it, which takes ten times as long. A subclass that writes a new
-        :meth:`compute` or the like, and no new Jacobian, has none.
+        Otherwise automatic differentiation computes it, which takes ten times as long. A subclass that overrides
+        :meth:`compute` or a related method must also override the Jacobian, or it has none.
 
         Args:
-            *values: as :meth:`compute` takes them, of which the first are states ``[*B, E, S]``.
+            *values: the arguments of :meth:`compute`, of which the first are states ``[*B, E, S]``.
 
         Returns:
             The result ``[*B, E, N]``, and the Jacobian ``[*B, E, N, S]``, or ``[N, S]`` if it is constant; between
-            tangents where the sub-model has ``tangents_of``, the spaces of what it reads and writes. ``None`` where it
-            is not known.
+            tangents if the sub-model has ``tangents_of``, the spaces of its input and output. ``None`` if it is not
+            known.
         """
         return None
 
     def linearised(self, entries: Entries, call: Call) -> tuple[Entries, Tensor, tuple[Space, Space] | None] | None:
-        """Returns what :meth:`on_entries` does, the :meth:`jacobian`, and between whose tangents it leads, if known."""
+        """Returns the result of :meth:`on_entries`, the :meth:`jacobian`, and the spaces of its tangents, if known."""
         found = self.jacobian(*self.values(entries))
         return None if found is None else ({self.out_keys[0]: found[0]}, found[1], self.tangents_of)
 
@@ -183,24 +184,24 @@ class SubModel(Checked, TensorDictModule):
             batch_size: ``[*B]``, or ``[*B, T]`` for a whole sequence.
             members: E, the size of the ensemble.
             state_dim: S.
-            observation_dim: O, of the reading that the sub-model uses.
+            observation_dim: O of the reading that the sub-model uses.
             time: whether the last of ``batch_size`` is time.
-            device: where to draw.
-            dtype: of floating noise.
+            device: device of the noise.
+            dtype: dtype of floating-point noise.
             generator: source of randomness; torch's global one by default.
 
         Returns:
-            A tensor ``[*batch_size, ...]``, or several by ``noise_names``; ``None`` where there is no noise, or a size
+            A tensor ``[*batch_size, ...]``, or several by ``noise_names``; ``None`` if there is no noise, or a size
             that it depends on is not known.
         """
         return None
 
     def noise_sizes(self, *values: Any, **_: Any) -> dict[str, int]:
-        """Returns the sizes that :meth:`draw_noise` needs, from the values that :meth:`compute` gets by position."""
+        """Returns the sizes that :meth:`draw_noise` needs, from the positional arguments of :meth:`compute`."""
         return {}
 
     def parts(self) -> dict[str, TensorDictModuleBase]:
-        """Returns the modules inside that may draw noise of their own, by name; ``""`` for its own place."""
+        """Returns the modules inside that may draw noise, by name; ``""`` for one at the sub-model's own place."""
         return {}
 
     @property
@@ -209,7 +210,7 @@ class SubModel(Checked, TensorDictModule):
         return "noise" in self._wants
 
     def on_entries(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the sub-model writes on entries; changes nothing.
+        """Returns the sub-model's outputs for entries, without changing the entries.
 
         Raises:
             KeyError: if an entry is missing.
@@ -217,7 +218,7 @@ class SubModel(Checked, TensorDictModule):
         try:
             values: list[Any] = list(map(entries.__getitem__, self.in_keys))
             values.extend(map(entries.get, self.optional_keys))
-        except KeyError:  # the message says what there is
+        except KeyError:  # raises with a message that lists the entries
             values = self.values(entries)
         extra: dict[str, Any] = {}
         if "batch_size" in self._wants:
@@ -232,7 +233,7 @@ class SubModel(Checked, TensorDictModule):
         return self.by_key(out)
 
     def values(self, entries: Entries) -> list[Any]:
-        """Returns the entries of ``in_keys``, then those of ``optional_keys``, ``None`` where one is missing.
+        """Returns the entries of ``in_keys``, then those of ``optional_keys``, ``None`` for a missing one.
 
         Raises:
             KeyError: if an entry of ``in_keys`` is missing.
@@ -243,7 +244,7 @@ class SubModel(Checked, TensorDictModule):
         """Returns the results of :meth:`compute` under :attr:`out_keys`.
 
         Raises:
-            ValueError: if it is not one tensor for each of them.
+            ValueError: if there is not one tensor for each key.
         """
         values = (out,) if isinstance(out, Tensor) else out if isinstance(out, (tuple, list)) else None
         if values is None or len(values) != len(self.out_keys):
@@ -272,7 +273,7 @@ class SubModel(Checked, TensorDictModule):
             value = tensordict.get(key, None)
             if value is not None:
                 entries[key] = value
-        if len(entries) < len(self.in_keys):  # the message is to list all that is there
+        if len(entries) < len(self.in_keys):  # for a message that lists all entries
             entries = dict.fromkeys(map(unravel_key, tensordict.keys(True, True))) | entries
         entries.update(flat_noise(tensordict.get("noise", None)))
         try:
@@ -296,7 +297,7 @@ class SubModel(Checked, TensorDictModule):
             given = given if len(given) == len(found) else None
         if given is None:
             where: dict[str, Any] = {}
-            # Where nothing is read, what is drawn lies next to the constants.
+            # Without inputs, noise is drawn on the device of the constants.
             for value in values if values else (*self.parameters(), *self.buffers()):
                 if value is not None and value.is_floating_point():
                     where = {"device": value.device, "dtype": value.dtype}
@@ -306,9 +307,9 @@ class SubModel(Checked, TensorDictModule):
                 record(call.place, self, sizes)
             where.update(sizes)
             given = self.draw_noise(call.batch_size, time=call.time, **where)
-            if given is None:  # it would run as if no noise were wanted
+            if given is None:  # it would run deterministically
                 raise ValueError(
-                    f"{type(self).__name__} at place {call.place!r} names noise, and its draw_noise drew none. Where "
+                    f"{type(self).__name__} at place {call.place!r} names noise, and its draw_noise drew none. If "
                     "that needs the number of members, or another size, return it from noise_sizes(self, *values): "
                     'for example {"members": ensemble.shape[-2]}.'
                 )
@@ -316,13 +317,13 @@ class SubModel(Checked, TensorDictModule):
 
 
 class Sensor(SubModel):
-    """Makes a reading, its noise, or a mask of it.
+    """Computes a reading, its noise, or a mask of it.
 
     Attributes:
-        observation_dim: O of what it writes, where it is known beforehand.
-        judges_reading: whether it writes no reading, but judges that of the module before it.
-        joins_readings: whether it looks at several readings together, and cannot do without one of them.
-        marks: masks that it derives where it finds missing readings, and the masks that they are derived from.
+        observation_dim: O of its output, if known beforehand.
+        judges_reading: whether it writes no reading, but noise or a mask for the reading of the module before it.
+        joins_readings: whether it combines several readings, and needs all of them.
+        marks: maps each mask that it writes, which also marks the readings that it finds missing, to the given mask.
     """
 
     observation_dim: int | None = None
@@ -335,11 +336,11 @@ class Initial(SubModel):
     """Writes the initial belief of an episode.
 
     Attributes:
-        state_dim: S; on a space, the numbers of a tangent.
+        state_dim: S; on a space, the dimension of a tangent.
         ensemble_size: E; ``None`` for a belief without members.
-        space: in which the states live; ``None`` for plain numbers.
-        input_dim: size of what it reads, where that is not S.
-        observed_key: a mask that hides what it reads; it then writes its prior.
+        space: space of the states; ``None`` for plain numbers.
+        input_dim: size of its input, if that is not S.
+        observed_key: observed mask of its input; where the input is missing, it writes its prior.
 
     Example:
         >>> from tensordict import TensorDict
@@ -361,7 +362,7 @@ class Initial(SubModel):
     observed_key: NestedKey | None = None
 
     def derived(self, carried: Entries) -> Entries:
-        """Returns further entries of the belief, by key, that follow from those that are carried on and from others."""
+        """Returns further entries of the belief, by key, computed from the carried entries and others."""
         return {}
 
 
@@ -369,27 +370,27 @@ class Transition(SubModel):
     """Forecasts the belief of the next time.
 
     Attributes:
-        mask_key: a mask that says whether the frame of the next time is observed, where the forecast depends on it.
+        mask_key: observed mask of the frame of the next time, if the forecast depends on it.
     """
 
     mask_key: NestedKey | None = None
 
     def without_step(self, entries: Entries) -> Entries:
-        """Returns what it writes in addition to the forecast where an episode begins and no step leads there."""
+        """Returns the outputs other than the forecast at the start of an episode, where no step is taken."""
         return {}
 
 
 class Update(SubModel):
-    """Takes in a reading: an analysis, or the likelihood of particles.
+    """Updates the belief with a reading: an analysis, or the likelihood of particles.
 
     Attributes:
-        reading_keys: the entries of the reading: the reading itself, and behind it its noise.
-        observed_key: the mask that hides them, ``[*B, 1]`` or ``[*B, O]``.
+        reading_keys: the entries of the reading: the reading itself, then its noise.
+        observed_key: their observed mask, ``[*B, 1]`` or ``[*B, O]``.
         predicted_key: the predicted reading, ``[*B, E, O]``.
         info_prefix: prefix of the diagnostics.
-        space: in which the states live; ``None`` for plain numbers.
-        reading_space: in which the reading lives; ``None`` for plain numbers.
-        observation_dim: O of the reading, where it is known beforehand.
+        space: space of the states; ``None`` for plain numbers.
+        reading_space: space of the reading; ``None`` for plain numbers.
+        observation_dim: O of the reading, if known beforehand.
 
     Example:
         >>> from tensordict import TensorDict
@@ -416,13 +417,13 @@ class Update(SubModel):
     observation_dim: int | None = None
 
     def reading_dims(self, entries: Entries, call: Call) -> Sequence[int | tuple[int, ...]]:
-        """Returns how many numbers each of ``reading_keys`` has, to put zeros behind a mask where it is missing.
+        """Returns the size of each of ``reading_keys``, so that zeros under a mask can replace a missing reading.
 
-        Of samples ``(E, O)``. By default O: ``observation_dim``, or what :attr:`predicted_key` holds. On a space the
-        noise is of tangents.
+        The size of samples is ``(E, O)``. The default is O: ``observation_dim``, or the size of :attr:`predicted_key`.
+        On a space the noise is of tangents.
 
         Raises:
-            KeyError: if that is not known.
+            KeyError: if the size is not known.
         """
         if self.reading_space is not None:
             others = [self.reading_space.tangent_dim] * (len(self.reading_keys) - 1)
@@ -432,21 +433,21 @@ class Update(SubModel):
             dim = predicted.shape[-1]
         if dim is None:
             raise KeyError(
-                f"{type(self).__name__} does not know how many numbers {list(self.reading_keys)} have, so that they "
-                f"cannot be left out. Hide them with their mask, {self.observed_key!r}; or let reading_dims() of "
-                f"{type(self).__name__} say it."
+                f"{type(self).__name__} does not know the sizes of {list(self.reading_keys)}, so that they cannot be "
+                f"left out. Mask them with {self.observed_key!r}; or return the sizes from reading_dims() of "
+                f"{type(self).__name__}."
             )
         return [dim] * len(self.reading_keys)
 
     def with_mask(self, entries: Entries, call: Call) -> Entries:
-        """Returns the entries with the mask of the reading, where a module inside makes it."""
+        """Returns the entries with the mask of the reading, if a module inside computes it."""
         return entries
 
     @property
     def updates_ensemble(self) -> bool:
-        """Tells whether it reads an ensemble, its predicted observations, the reading, its noise, and a mask.
+        """Tells whether its inputs are an ensemble, predicted observations, the reading, its noise, and a mask.
 
-        Such an analysis can be given a past to correct (:meth:`move_past`).
+        Such an analysis can also correct a lag window (:meth:`move_past`).
         """
         keys = [unravel_key(key) for key in self.in_keys]
         read = [unravel_key(key) for key in (self.predicted_key, *self.reading_keys)]
@@ -464,22 +465,22 @@ class Update(SubModel):
     ) -> Tensor:
         """Updates earlier states of the members of an ensemble with the same reading.
 
-        By default as :meth:`compute` would if they were one state of L times S components, inflation and the like
-        included. Where :meth:`compute` holds anything of S components, write this method, too.
+        The default calls :meth:`compute` with the L times S components as one state, inflation and the like included.
+        A :meth:`compute` with constants of S components needs its own version of this method.
 
         Args:
             past: ``[*B, E, L, S]``.
             predicted: predicted observations ``[*B, E, O]``.
             observation: learned observations ``[*B, E, O]``, or one reading ``[*B, O]``.
-            variance: of the reading, ``[*B, O]``.
-            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` where all is observed.
-            noise: what :meth:`compute` was given: the same draws.
+            variance: variances of the reading, ``[*B, O]``.
+            observed: mask ``[*B, 1]`` or ``[*B, O]``; ``None`` if all is observed.
+            noise: the same draws as in :meth:`compute`.
 
         Returns:
             The updated past, ``[*B, E, L, S]``.
 
         Raises:
-            RuntimeError: if :meth:`compute` does not take so many components.
+            RuntimeError: if :meth:`compute` fails on that many components.
         """
         extra = {"noise": noise} if self.draws else {}
         try:
@@ -492,23 +493,23 @@ class Update(SubModel):
         return out[self.out_keys[0]].unflatten(-1, past.shape[-2:])
 
     def aligned(self, entries: Entries) -> Entries:
-        """Returns the entries with all angles on one turn, so that they can be averaged like other numbers."""
+        """Returns the entries with all angles unwrapped to one turn, so that they can be averaged."""
         return entries
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:
-        """Does what :meth:`on_entries` does, on entries that are :meth:`aligned` already."""
+        """Works like :meth:`on_entries`, on entries that are :meth:`aligned` already."""
         return self.on_entries(entries, call)
 
 
-#: A part that does not have a role declares what the role does by default.
+#: Defaults of each role, for a part that does not have that role.
 _DEFAULTS = {kind: kind(nn.Identity(), [], []) for kind in (SubModel, Sensor, Initial, Transition, Update)}
 
 
 def role(module: object, kind: type[R]) -> R:
-    """Returns a module in its role; one that does not have it, as any TensorDict module may, with the role's defaults.
+    """Returns a module in its role; for any other TensorDict module, an object with the role's defaults.
 
     Args:
-        module: of a filter.
+        module: a module of a filter.
         kind: :class:`Sensor`, :class:`Initial`, :class:`Transition`, :class:`Update`, or any :class:`SubModel`.
 
     Example:
@@ -520,11 +521,11 @@ def role(module: object, kind: type[R]) -> R:
 
 
 def in_role(module: nn.Module, kind: type[R]) -> list[R]:
-    """Returns the sub-models inside ``module`` that have a role, also those inside others; all for ``SubModel``."""
+    """Returns the sub-models inside ``module``, nested ones included, that have a role; all for ``SubModel``."""
     return [part for part in module.modules() if isinstance(part, kind)]
 
 
-#: Told, in a trial step, the place of each sub-model that draws noise, the sub-model, and the sizes it asks for.
+#: Called in a trial step with the place of each sub-model that draws noise, the sub-model, and its noise sizes.
 RECORDERS: list[Callable[[str, SubModel, dict[str, int]], None]] = []
-#: Errors that can be raised again with more words.
+#: Errors that are raised again with an explanation.
 EXPLAINED = (RuntimeError, TypeError, ValueError, IndexError)

@@ -1,4 +1,4 @@
-"""The arms: their geometry and controller, and how their readings come about."""
+"""The arms: their geometry, controller and sensors."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from torchrl.envs import Compose, DoubleToFloat, GrayScale, SerialEnv, ToTensorI
 from torchrl.envs.libs.dm_control import DMControlWrapper
 from torchrl.envs.transforms import ObservationTransform, Transform
 
-SIDE, FINE = 64, 2  # pixels of a picture's side, and how many of the rendering each averages, along a side
+SIDE, FINE = 64, 2  # pixels along an image's side, and rendered pixels along a side of each
 NOISE = 0.1  # rad
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Into [-pi, pi)."""
+    """Wraps an angle into [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
 
 
 @dataclass
 class Arm:
-    """Holds what the study needs of an arm; its state is the joints' cosines, sines and velocities ``[3 J]``."""
+    """Parameters and geometry of an arm; its state is the joints' cosines, sines and velocities ``[3 J]``."""
 
     domain: str
     task: str
     links: tuple[float, ...]  # m
     dt: float  # s
     actions: int
-    stiffness: float  # of the controller: action a rad
-    damping: float  # action a rad/s
+    stiffness: float  # of the controller: action per rad
+    damping: float  # action per rad/s
     torques: tuple[float, ...]  # of full actions, N m
-    view: float  # from the root, in the middle of a picture, to its side, m
-    creep: float  # noise of an angle in a step, for what the motion does not know: floor, things in the hand; rad
-    ahead: float = 0.0  # direction of the links where all angles are 0, rad
-    weights: tuple[float, ...] = (0.0, 0.0)  # torque of each link and of what it carries, when it lies flat, N m
+    view: float  # half the width of an image, whose middle is the root, m
+    creep: float  # noise of an angle in a step, for unmodelled contacts: floor, objects in the hand; rad
+    ahead: float = 0.0  # direction of the links if all angles are 0, rad
+    weights: tuple[float, ...] = (0.0, 0.0)  # gravity torque of each link and its load, when it lies flat, N m
 
     @property
     def joints(self) -> int:
@@ -53,17 +53,17 @@ class Arm:
         return torch.cat([angles.cos(), angles.sin(), velocity], -1)
 
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
+        """Returns angles in (-pi, pi] and velocities; a sensor's errors may follow in the state."""
         cos, sin, velocity = state[..., : 3 * self.joints].split(self.joints, -1)
         return torch.atan2(sin, cos), velocity
 
     def places(self, angles: Tensor) -> Tensor:
-        """Returns the links' ends of angles ``[*, J]``, from the root, in the plane of motion, m ``[*, J, 2]``."""
+        """Returns the links' ends at angles ``[*, J]``, from the root, in the plane of motion, m ``[*, J, 2]``."""
         turned, links = self.ahead + angles.cumsum(-1), torch.tensor(self.links)
         return torch.stack([links * turned.cos(), links * turned.sin()], -1).cumsum(-2)
 
     def angles(self, places: Tensor) -> Tensor:
-        """The angles, in [-pi, pi), of links that end at ``places``, whatever their lengths."""
+        """Returns the angles, in [-pi, pi), of links of any length that end at ``places``."""
         x, y = torch.cat([places[..., :1, :], places.diff(dim=-2)], -2).unbind(-1)
         turned = torch.atan2(y, x) - self.ahead
         return wrap(torch.cat([turned[..., :1], turned.diff(dim=-1)], -1))
@@ -73,7 +73,7 @@ class Arm:
         return self.places(angles)[..., -1, :]
 
     def goal(self, emitted: TensorDictBase) -> Tensor:
-        """The joint angles to go to, at the start of an episode."""
+        """Returns the goal of the joint angles at the start of an episode."""
         angles = self.split(self.state(emitted))[0]
         if self.domain != "reacher":  # upright, away from floor and walls
             return 1.6 * torch.rand_like(angles) - 0.8
@@ -85,17 +85,15 @@ class Arm:
         return torch.stack([shoulder, wrist], -1)
 
     def hold(self, angles: Tensor) -> Tensor:
-        """The action that holds the arm against gravity, of angles ``[*, J]``; angles are 0 where a link stands up."""
+        """Returns the action that holds the arm against gravity at angles ``[*, J]``, zero for upright links."""
         flat = torch.tensor(self.weights) * angles.cumsum(-1).sin()
         return -flat.flip(-1).cumsum(-1).flip(-1) / torch.tensor(self.torques)  # a joint carries all that follows
 
     def control(self, state: Tensor, goal: Tensor, explore: float = 0.0) -> Tensor:
-        """The policy, whatever its estimate of the state comes from.
+        """Returns the action for an estimate of the state: PD control with gravity compensation at the goal.
 
-        Proportional to the angles' errors, damped, and what holds the arm at its goal.
-
-        With ``explore`` random actions come on top, the larger the later the arm stands in the batch; an arm at rest
-        has to be learned, too.
+        ``explore`` adds random actions, whose size grows along the batch from zero, so that the motion also learns from
+        arms at rest.
         """
         angles, velocity = self.split(state)
         error = torch.cat(
@@ -129,7 +127,7 @@ ARMS = {
 class Encoders(Transform):
     """Writes ``"state"``, the episode's ``"goal"``, ``"reading"`` (cosines, sines of noisy angles) and ``"observed"``.
 
-    The reading of a reset is always there, of the others the share ``missing`` is not.
+    The reading of a reset is always observed; of the others the share ``missing`` is missing.
     """
 
     def __init__(self, arm: Arm, missing: float):
@@ -158,9 +156,9 @@ class Encoders(Transform):
 
 
 class Average(ObservationTransform):
-    """Pictures of a side of ``SIDE`` pixels, each the mean of some: arms that are a pixel wide need smooth edges.
+    """Downsamples images to ``SIDE`` pixels along a side by averaging: arms that are a pixel wide need smooth edges.
 
-    MuJoCo's own smoothing and shadows cost ten times as much as all the rest.
+    MuJoCo's own antialiasing and shadows cost ten times as much as all the rest.
     """
 
     def __init__(self):
@@ -178,7 +176,7 @@ class Average(ObservationTransform):
 
 
 class HoldAngles(Transform):
-    """Writes ``"held"``: the last reading that was there, and the mean of its differences over the last five or so."""
+    """Writes ``"held"``: the last observed angles, and velocities smoothed over about five steps."""
 
     def __init__(self, arm: Arm, in_key):
         super().__init__(in_keys=[in_key], out_keys=["held"])
@@ -218,7 +216,7 @@ def make_one(arm: Arm, pixels: bool) -> DMControlWrapper:
 
 
 def make_env(arm: Arm, pixels: bool, episodes: int, missing: float = 0.0) -> TransformedEnv:
-    """``episodes`` arms side by side."""
+    """Returns an environment of ``episodes`` arms in one batch."""
     images = [ToTensorImage(), GrayScale(), Average()] if pixels else []
     arms = SerialEnv(episodes, partial(make_one, arm, pixels))
     return TransformedEnv(arms, Compose(DoubleToFloat(), *images, Encoders(arm, missing)))

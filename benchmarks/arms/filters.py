@@ -1,4 +1,4 @@
-"""The filter of an arm's joints: its motion, its sensor, the sensor's errors, and how motion and sensor are learned."""
+"""The filter of an arm's joints: motion, sensor, the sensor's biases, and the training of motion and sensor."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from torch_denkf.filters import DEnKF
 from torch_denkf.training import Stage
 from torch_denkf.training.parts import train_part
 
-# What follows was chosen on other episodes than those of the tests, see README.md.
+# These settings were chosen on other episodes than those of the tests, see README.md.
 MEMBERS = 256
-DRIFT = 0.005  # noise of an angle after a way of 1 rad, beside those of the accelerations and of a step, rad
-LENGTH = 0.3  # rad: a motion after which a picture is read with other errors
-FASTER = 1.25  # than any joint was seen to turn: no member is
+DRIFT = 0.005  # noise of an angle after a turn of 1 rad, in addition to acceleration noise and creep, rad
+LENGTH = 0.3  # rad: correlation length of the sensor's biases
+FASTER = 1.25  # limit of the members' speeds, in units of the fastest recorded speed of each joint
 
 
 class ArmTransition(m.Transition):
     """Learned accelerations and their noise; old and new velocity turn the angle, whose cosine and sine are the state.
 
-    An arm at rest that is held against gravity stays where it is: what the network says of it is taken away.
+    An arm at rest that is held against gravity stays at rest: the network's mean for that case is subtracted.
 
-    With ``bias`` the errors of a sensor follow in the state, of standard deviations ``bias``. A picture of an arm at
-    rest is read with the same error again and again, and with another one when the arm has moved: the errors fade
-    with the way that the joints went, not with time. So the angles get lost with their way, too.
+    With ``bias``, the state also has the sensor's biases, of these standard deviations. All images of an arm at rest
+    have the same error, and images of another pose another one: the biases decay with the angle that the joints have
+    turned, not with time. The noise of the angles grows with that angle, too.
     """
 
     def __init__(
@@ -43,14 +43,14 @@ class ArmTransition(m.Transition):
         self.arm = arm
         self.register_buffer("scale", scale)  # of velocities, rad/s
         self.register_buffer("fastest", fastest)  # of velocities, rad/s
-        self.register_buffer("change", change)  # of their steps, rad/s
-        self.register_buffer("lead", lead)  # share of its change that a velocity has on average in a step
+        self.register_buffer("change", change)  # standard deviation of a velocity's change in a step, rad/s
+        self.register_buffer("lead", lead)  # share of its change that the mean velocity of a step includes
         self.register_buffer("bias", bias)
 
     def faster(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the change of the velocities in a step, rad/s, of states ``[*, 3 J]``.
+        """Returns mean and standard deviation of the velocity change in a step, rad/s, at states ``[*, 3 J]``.
 
-        The network reads velocities no larger than ``fastest``: beyond, the noise that it claims grows with them.
+        Velocities are clamped to ``fastest`` before the network: beyond, its predicted noise grows with them.
         """
         angles, velocity = self.arm.split(state)
         velocity = velocity.clamp(-self.fastest, self.fastest)
@@ -68,7 +68,7 @@ class ArmTransition(m.Transition):
         mean, std = self.faster(state, action)
         after = (velocity + mean + std * torch.randn_like(std)).clamp(-self.fastest, self.fastest)
         ways = self.arm.dt * velocity.abs()
-        # Without the creep an arm at rest would be believed for ever.
+        # Without the creep the variance of an arm at rest would vanish.
         drift = (DRIFT**2 * ways + self.arm.creep**2).sqrt() * torch.randn_like(ways)
         turned = angles + self.arm.dt * torch.lerp(velocity, after, self.lead) + drift
         moved = self.arm.join(turned, after)
@@ -80,20 +80,20 @@ class ArmTransition(m.Transition):
 
 
 def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error: Tensor | None) -> DEnKF:
-    """State [cos, sin, velocity] of each joint; encoders read cosines and sines, a sensor of pictures places.
+    """Returns a filter of the state [cos, sin, velocity] per joint; encoders read cos and sin, images link positions.
 
     Args:
         arm: the arm.
         motion: episodes ``[N, T]`` of states and actions.
-        sensor: of pictures, or ``None`` for encoders.
-        error: standard deviations of what the sensor reads ``[2 J]``.
+        sensor: of images, or ``None`` for encoders.
+        error: standard deviations of the sensor's errors ``[2 J]``, or ``None`` for encoders.
     """
     size = 2 * arm.joints
     angles, velocity = arm.split(motion["state"])
     steps = velocity.diff(dim=1).flatten(0, 1)
     change = steps.std(0)
     beyond = wrap(angles.diff(dim=1)).flatten(0, 1) / arm.dt - velocity[:, :-1].flatten(0, 1)
-    lead = (beyond * steps).sum(0) / steps.square().sum(0)  # 1 in MuJoCo's Euler step; of several it is less
+    lead = (beyond * steps).sum(0) / steps.square().sum(0)  # 1 for one of MuJoCo's Euler steps, less for several
     fastest = FASTER * velocity.abs().amax((0, 1))
     transition = ArmTransition(arm, velocity.flatten(0, 1).std(0), fastest, change, lead, error)
     key, first = "reading", motion["state"][:, 0]
@@ -115,14 +115,14 @@ def make_filter(arm: Arm, motion: TensorDict, sensor: JointSensor | None, error:
 
 
 def train_sensor(sensor: JointSensor, frames: TensorDict, updates: int, out: Path, seed: int) -> None:
-    """On single pictures ``[N]``, each of another pose."""
+    """Trains the sensor on single images ``[N]``, each of another pose."""
     loss = lambda batch: sensor.losses(batch["pixels"], batch["state"])  # noqa: E731
     stage = Stage("sensor", loss, random_rows(frames, 48), updates)
     train_part(sensor, stage, out=out / stage.name, loggers=(), device="cpu", seed=seed)
 
 
 def train_motion(denkf: DEnKF, motion: TensorDict, updates: int, out: Path, seed: int) -> None:
-    """The accelerations, on single steps of true states: likelihood of the next velocities."""
+    """Trains the accelerations on single steps of true states, by the likelihood of the next velocities."""
     transition: ArmTransition = denkf["transition"]
     state, action = (motion[key][:, :-1].flatten(0, 1) for key in ("state", "action"))
     faster = motion["state"].diff(dim=1)[..., 2 * transition.arm.joints :].flatten(0, 1) / transition.change

@@ -24,14 +24,14 @@ SCORES = {
 
 
 def difference(rows: pd.DataFrame, name: str) -> str:
-    """Compares the belief's episodes with the readings' of the same starts: mean difference, interval, and share."""
+    """Returns the mean difference of belief and readings in the same episodes, its interval, and its share."""
     wide = rows.pivot(index=["seed", "episode"], columns="estimate", values=name)
     center, low, high = bootstrap_interval((wide["belief"] - wide["reading"]).to_numpy())
     return f"{center:+.2f} [{low:+.2f}, {high:+.2f}], {center / wide['reading'].mean():+.0%}"
 
 
 def page(rows: pd.DataFrame) -> str:
-    """The tables of all tasks and sources that there are rows of; the truth is never missing."""
+    """Returns the tables of all tasks and sources in the rows."""
     shown = {name: SCORES[name] for name in ("angle", "tip", "velocity", "effort")}
     cases = {case: [difference(own, name) for name in shown] for case, own in rows.groupby(CASE, sort=False)}
     compared = pd.DataFrame.from_dict(cases, orient="index", columns=list(shown.values()))

@@ -1,4 +1,4 @@
-"""The sensor of pictures: it finds an arm's joints; where they should be, geometry says."""
+"""The sensor of images, which finds an arm's joints, and its measurement model by geometry."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ MIDDLES = (2 * torch.arange(CELLS) + 1) / CELLS - 1  # of cells, from -1 (left) 
 
 
 def layers(before: int, after: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
-    """Convolution, normalisation, ReLU."""
+    """Returns convolution, normalisation and ReLU."""
     return nn.Sequential(
         nn.Conv2d(before, after, kernel, stride, kernel // 2), nn.GroupNorm(8, after), nn.ReLU(inplace=True)
     )
 
 
 class Maps(nn.Module):
-    """Pictures ``[N, 1, H, W]`` to the logits of a map for each joint ``[N, J, H / 2, W / 2]``.
+    """Maps images ``[N, 1, H, W]`` to the logits of a map for each joint ``[N, J, H / 2, W / 2]``.
 
-    Three scales on the way down, and what was seen at each is added on the way up: which joint it is, only the whole
-    arm says; where it is, only the fine scale.
+    A U-net of three scales: the coarse one tells the joints apart, the fine one locates them.
     """
 
     def __init__(self, joints: int, channels: tuple[int, int, int] = (24, 32, 48)):
@@ -50,9 +49,9 @@ class Maps(nn.Module):
 
 
 class JointSensor(Sensor):
-    """Reads where an arm's links end, m ``[*B, 2 J]``, from pictures ``[*B, 1, H, W]``.
+    """Estimates the ends of an arm's links, m ``[*B, 2 J]``, from images ``[*B, 1, H, W]``.
 
-    A map for each joint says where in the picture it is; its mean is the joint's place.
+    The estimate is the mean of a map over the image for each joint.
 
     Reference:
         Lee et al., "Camera-to-robot pose estimation from a single image", ICRA 2020, arXiv:1911.09231: joints on maps.
@@ -64,7 +63,7 @@ class JointSensor(Sensor):
         self.arm, self.observation_dim = arm, 2 * arm.joints
 
     def places(self, maps: Tensor) -> Tensor:
-        """Means of maps ``[*B, J, H, W]``, m ``[*B, J, 2]``."""
+        """Returns means of maps ``[*B, J, H, W]``, m ``[*B, J, 2]``."""
         share = maps.flatten(-2).softmax(-1).unflatten(-1, maps.shape[-2:])
         middle = torch.stack([share.sum(-2) @ MIDDLES, -(share.sum(-1) @ MIDDLES)], -1)  # rows go down
         return self.arm.view * middle
@@ -74,7 +73,7 @@ class JointSensor(Sensor):
         return self.places(maps).flatten(-2).unflatten(0, pixels.shape[:-3])
 
     def losses(self, pixels: Tensor, state: Tensor) -> dict[str, Tensor]:
-        """Scores pictures ``[N, 1, H, W]`` and states: maps against a bump of a cell at each joint, and places."""
+        """Returns the losses of images ``[N, 1, H, W]`` and states: maps against a bump at each joint, and places."""
         maps, truth = self.module(pixels), self.arm.places(self.arm.split(state)[0])
         across, up = (truth / self.arm.view).unsqueeze(-1).unbind(-2)
         column, row = ((-0.5 * ((MIDDLES - at) * CELLS / 2).square()).softmax(-1) for at in (across, -up))
@@ -87,7 +86,7 @@ class JointSensor(Sensor):
 
 
 class JointPlaces(Sensor):
-    """Returns the ends of the links of members ``[*B, E, 3 J + 2 J]``, and what the sensor adds to it: its biases."""
+    """Maps members ``[*B, E, 3 J + 2 J]`` to the ends of their links plus the sensor's biases."""
 
     def __init__(self, arm: Arm):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
@@ -99,7 +98,7 @@ class JointPlaces(Sensor):
 
 
 class FromPlaces(m.FromSensor):
-    """A belief of an arm and of its sensor's biases from the places that the sensor reads first."""
+    """Initial belief of an arm and of its sensor's biases from the first places that the sensor reads."""
 
     def __init__(self, arm: Arm, *, mean: Tensor, std: Tensor, bias: Tensor, ensemble_size: int):
         mean, std = torch.cat([mean, torch.zeros_like(bias)]), torch.cat([std, bias])

@@ -39,19 +39,19 @@ class Study:
     tasks: some_of(ARMS) = tuple(ARMS)
     sources: some_of(SOURCES) = ("encoders",)
     demos: int = 100  # episodes of 200 steps to learn the motion from
-    pictures: int = 24000  # of single poses, to learn the sensor from
-    films: int = 40  # episodes of 60 steps with pictures, to measure the sensor's errors on
+    pictures: int = 24000  # images of single poses, to learn the sensor from
+    films: int = 40  # episodes of 60 steps with images, to measure the sensor's errors on
     episodes: int = 40  # to test on
     steps: int = 200  # of a test episode
     motion_updates: int = 8000
     sensor_updates: int = 6000
     seed: int = 0
-    out: Path = Path("runs/dm_control_arms")  # a run that was broken off goes on from here
+    out: Path = Path("runs/dm_control_arms")  # an interrupted run resumes from here
     smoke: bool = False  # some seconds, to see that it runs
 
 
 def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) -> TensorDict:
-    """Episodes ``[N, T]`` that begin alike for all policies."""
+    """Returns episodes ``[N, T]``; their initial states depend only on the seed."""
     torch.manual_seed(seed)
     env.set_seed(seed)
     with torch.no_grad():
@@ -59,7 +59,7 @@ def run(env: TransformedEnv, policy: TensorDictModule, steps: int, seed: int) ->
 
 
 def collect(arm: Arm, pixels: bool, episodes: int, steps: int, seed: int) -> TensorDict:
-    """Episodes of the controller on the truth with noise on its actions."""
+    """Returns episodes of the controller on the truth with noise on its actions."""
     env = make_env(arm, pixels, min(AT_ONCE, episodes))
     policy = TensorDictModule(partial(arm.control, explore=0.5), in_keys=["state", "goal"], out_keys=["action"])
     rounds = range(-(-episodes // AT_ONCE))
@@ -69,7 +69,7 @@ def collect(arm: Arm, pixels: bool, episodes: int, steps: int, seed: int) -> Ten
 
 
 def poses(arm: Arm, count: int, seed: int) -> TensorDict:
-    """Pictures and states ``[N]`` of arms that an episode begins with."""
+    """Returns images and states ``[N]`` of arms at the start of episodes."""
     env = make_env(arm, True, min(AT_ONCE, count))
     torch.manual_seed(seed)
     env.set_seed(seed)
@@ -79,7 +79,7 @@ def poses(arm: Arm, count: int, seed: int) -> TensorDict:
 
 
 def trained(arm: Arm, pixels: bool, study: Study, out: Path) -> DEnKF:
-    """The filter of an arm; the seeds of all that it learns from differ."""
+    """Returns the trained filter of an arm; each part learns from data of another seed."""
     seed = 10_000 * (study.seed + 1)
     torch.manual_seed(study.seed)
     sensor = error = None
@@ -98,7 +98,7 @@ def trained(arm: Arm, pixels: bool, study: Study, out: Path) -> DEnKF:
 
 
 def scores(arm: Arm, episodes: TensorDict, key) -> list[dict]:
-    """A row for each episode. What is at the end is of its last quarter, when the arm should rest at its goal."""
+    """Returns a row for each episode; scores "at the end" are of its last quarter, when the arm should be at rest."""
     estimate, truth = (arm.split(episodes["next", name]) for name in (key, "state"))
     last = episodes.shape[1] // 4
     believed, tip = (100 * arm.tip(part[0][:, -last:]) for part in (estimate, truth))
@@ -118,7 +118,7 @@ def scores(arm: Arm, episodes: TensorDict, key) -> list[dict]:
 
 
 def compare(arm: Arm, denkf: DEnKF, missing: float, pixels: bool, study: Study) -> list[dict]:
-    """One controller on readings, belief and truth in the same episodes; the truth is never missing, nor seen."""
+    """Returns the rows of one controller on readings, belief and true state, in the same episodes."""
     reading = denkf["analysis"].in_keys[2]
     cases = {"reading": "held", "belief": ("belief", "mean")} | ({} if missing else {"truth": "state"})
     rows, envs = [], {}
@@ -156,7 +156,7 @@ def rows_of(task: str, source: str, study: Study) -> list[dict]:
 
 
 def run_study(study: Study) -> None:
-    """Runs what is not there, and leaves ``table.csv`` and ``table.md`` in the study's folder.
+    """Runs the missing parts, and writes ``table.csv`` and ``table.md`` to the study's folder.
 
     Raises:
         SystemExit: if the folder was begun with other settings, or if dm_control cannot show an arm.

@@ -1,1 +1,1 @@
-"""Estimates which way is up, by a gyro and an accelerometer."""
+"""Estimates the tilt of a body from a gyro and an accelerometer."""

@@ -17,7 +17,7 @@ __all__ = ["error_state_filter", "integrate", "mahony"]
 
 
 def integrate(gyro: ndarray, dt: ndarray, start: ndarray) -> ndarray:
-    """Orientations ``[R, T, 4]`` by the gyro alone, ``[R, T, 3]``; ``start`` ``[R, 4]`` is that of the first row."""
+    """Returns orientations ``[R, T, 4]`` by the gyro ``[R, T, 3]`` alone; the first row's is ``start`` ``[R, 4]``."""
     found = [start]
     for row in range(1, gyro.shape[1]):
         found.append(product(found[-1], exp(gyro[:, row] * dt[:, row])))
@@ -27,15 +27,15 @@ def integrate(gyro: ndarray, dt: ndarray, start: ndarray) -> ndarray:
 def mahony(
     gyro: ndarray, force: ndarray, dt: ndarray, start: ndarray, proportional: float = 0.5, integral: float = 0.05
 ) -> ndarray:
-    """Orientations ``[R, T, 4]``: the gyro, pulled to where the accelerometer says up is.
+    """Returns orientations ``[R, T, 4]`` by Mahony's filter: the gyro, corrected towards the accelerometer's vertical.
 
     Args:
         gyro: ``[R, T, 3]`` rad/s.
-        force: what the accelerometer reads, ``[R, T, 3]``, in any unit.
+        force: of the accelerometer, ``[R, T, 3]``, in any unit.
         dt: ``[R, T, 1]`` s.
         start: orientations ``[R, 4]`` of the first row.
-        proportional: of the pull, 1/s.
-        integral: of the pull of the bias, 1/s^2.
+        proportional: gain of the correction, 1/s.
+        integral: gain of the bias's correction, 1/s^2.
     """
     found, bias = [start], np.zeros((len(start), 3))
     for row in range(1, gyro.shape[1]):
@@ -56,11 +56,11 @@ def error_state_filter(
     start_std: float = 0.05,
     bias_std: float = 0.01,
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """An extended Kalman filter of an orientation and the gyro's bias, whose errors are turns in the body's axes.
+    """Runs an extended Kalman filter of orientation and gyro bias, with orientation errors in body axes.
 
     Args:
         gyro: ``[R, T, 3]`` rad/s.
-        force: what the accelerometer reads, ``[R, T, 3]``, in any unit; its direction is the reading.
+        force: of the accelerometer, ``[R, T, 3]``, in any unit; its direction is the reading.
         dt: ``[R, T, 1]`` s.
         start: orientations ``[R, 4]`` of the first row.
         gyro_noise: density in rad/s/sqrt(Hz).
@@ -100,7 +100,7 @@ def error_state_filter(
 
 
 def _up(q: ndarray) -> ndarray:
-    """The world's z in the body's axes."""
+    """Returns the world's z in the body's axes."""
     return matrix(q)[..., 2, :]
 
 

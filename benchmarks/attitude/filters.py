@@ -1,4 +1,4 @@
-"""The library's filters of orientations: which way is up, by gyro and accelerometer, and with a few more readings."""
+"""The library's filters of orientations, by gyro and accelerometer, and with a few more readings."""
 
 from __future__ import annotations
 
@@ -21,45 +21,45 @@ __all__ = ["GivenNoise", "VelocityInBody", "attitude_filter", "inertial_filter",
 
 Kind = Literal["EKF", "UKF", "etkf", "perturbed"]
 FEATURES = ("size", "turn", "unrest")  # of a reading of the accelerometer
-LEG = 0.1  # m/s: how wrong the base's velocity is that a standing foot tells; set by us, and not tuned
+LEG = 0.1  # m/s: standard deviation of the base's velocity from the standing foot; set by us, and not tuned
 _UNREST = 1.0  # s
 _START = (0.05, 0.3, 0.1, 0.01, 0.1)  # standard deviations: rad, m/s, m, rad/s, m/s^2
 
 
 class GivenNoise(Sensor):
-    """Variances ``[*B, 3]`` of an entry ``[*B, 1]`` with the standard deviation, so that a batch tries several."""
+    """Noise from an entry ``[*B, 1]``, the standard deviation, so that one batch tries several values."""
 
     def __init__(self, in_key: str = "std"):
         super().__init__(nn.Identity(), [in_key], [("sensor", "noise")])
         self.observation_dim = 3
 
     def compute(self, std):
-        """The same for all three numbers."""
+        """Returns the variance, repeated for all three components."""
         return std.square().expand(*std.shape[:-1], 3)
 
 
 class VelocityInBody(SubModel):
-    """The velocity in the body's own axes ``[*B, E, 3]`` of states whose first part is of ``SE23()``."""
+    """Maps states whose first part is of ``SE23()`` to velocities in the body's axes ``[*B, E, 3]``."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
 
     def compute(self, state):
-        """Turned back from the world's axes."""
+        """Returns the velocity, rotated from the world's axes to the body's."""
         return rotate(SO3().inverse(state[..., :4]), state[..., 4:7])
 
 
 def prepared(data: TensorDict) -> TensorDict:
-    """A log with what the filters read besides: where up is, features of that reading, masks, and states.
+    """Returns a log with the filters' further inputs: direction of the accelerometer, its features, masks, and states.
 
     Args:
         data: of :mod:`benchmarks.attitude.task`, ``[R, T]``.
 
     Returns:
-        ``"up"``, the direction of the accelerometer's reading; ``"features"`` ``[R, T, 3]``: how far its size is from
-        gravity and how far it was in the last second, in m/s^2, and the rate of turn in rad/s; ``"rest"``, zeros in
-        m/s; ``"attitude"`` and ``"inertial"``, states of the two motions, without biases and motion: filters start
-        from those of the first row. Magnetometer, rest and leg have a reading in every tenth row.
+        ``"up"``, the direction of the accelerometer's reading; ``"features"`` ``[R, T, 3]``: the difference of its norm
+        from gravity, the same averaged over about a second, both in m/s^2, and the angular rate in rad/s; ``"rest"``,
+        zeros in m/s; ``"attitude"`` and ``"inertial"``, states of the two motions, with zero biases and velocities:
+        filters start from those of the first row. Magnetometer, rest and leg have a reading in every tenth row.
     """
     data = data.clone()
     force, runs, rows = data["accelerometer"], *data.shape
@@ -91,14 +91,14 @@ def attitude_filter(
     magnetometer: bool = False,
     **options,
 ) -> Filter:
-    """Orientation and the gyro's bias, moved by the gyro; the accelerometer's direction is the reading.
+    """Returns a filter of orientation and gyro bias, driven by the gyro; the accelerometer's direction is the reading.
 
     Args:
-        kind: of filter; of ensembles the scheme.
+        kind: of filter; for ensembles the scheme.
         gyro_noise: density in rad/s/sqrt(Hz).
         up_noise: standard deviation of the direction, in rad, or a module that writes its variances ``[*B, 3]``.
         members: of ensembles.
-        magnetometer: read it, too; in a :class:`~torch_denkf.FusedFilter`, whose Gaussian kind is the extended one.
+        magnetometer: read it, too, in a :class:`~torch_denkf.FusedFilter`, whose Gaussian kind is the EKF.
         **options: of the ensemble's analysis.
     """
     motion = AttitudeMotion("dt", gyro_noise=gyro_noise, gyro_walk=Sensors().gyro_walk)
@@ -128,16 +128,16 @@ def inertial_filter(
     feet: bool = False,
     **options,
 ) -> FusedFilter:
-    """Orientation, velocity, position and both biases, moved by gyro and accelerometer; the body stays about a place.
+    """Returns a filter of orientation, velocity, position and biases of a body that stays about a place.
 
     Args:
         kind: ``"EKF"``, or the scheme of an ensemble.
         gyro_noise: density in rad/s/sqrt(Hz).
-        rest_noise: ten times a second the velocity is read to be zero: with this standard deviation, in m/s, or a
+        rest_noise: standard deviation of the pseudo-observation of zero velocity, ten times a second, in m/s, or a
             module that writes variances ``[*B, 3]``.
         members: of ensembles.
         magnetometer: read it, too.
-        feet: read ``"leg"``, the velocity in the body's axes by the foot that stands, in the place of rest.
+        feet: read ``"leg"``, the body velocity by the stance foot, instead of a velocity of zero.
         **options: of the ensemble's analyses.
     """
     sheet = Sensors()

@@ -1,4 +1,4 @@
-"""Roll and pitch of a walk: a filter's intervals, Mahony's filter beside them."""
+"""Roll and pitch of a walk: a filter's intervals, Mahony's filter for comparison."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STRETCH = slice(300, 800)  # rows: five seconds of the walk
 
 
 def roll_and_pitch(orientation: Tensor) -> Tensor:
-    """Of quaternions ``[*, 4]``: turns about x and about y in rad, ``[*, 2]``, of R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Returns roll and pitch ``[*, 2]``, rad, of quaternions ``[*, 4]``, with R = Rz(yaw) Ry(pitch) Rx(roll)."""
     w, x, y, z = orientation.unbind(-1)
     roll = torch.atan2(2 * (w * x + y * z), 1 - 2 * (x.square() + y.square()))
     return torch.stack([roll, torch.asin((2 * (w * y - z * x)).clamp(-1, 1))], -1)
@@ -39,13 +39,13 @@ def draw(
     Args:
         data: ``[T]``, with the true ``"orientation"`` and ``"dt"``.
         orientation: of the filter, ``[T, 4]``.
-        cov: ``[T, 3, 3]``, of turns about the body's axes. Roll and pitch are taken for turns about x and y, which
-            they are while both are small.
+        cov: ``[T, 3, 3]``, of rotations about the body's axes. Roll and pitch are approximated by rotations about x and
+            y, which is valid for small angles.
         other: orientations of Mahony's filter, ``[T, 4]``.
         path: PNG.
         name: of the filter.
         level: of the intervals.
-        rows: that are drawn.
+        rows: to draw.
     """
     seconds = data["dt"].squeeze(-1).cumsum(0)[rows]
     half = NormalDist().inv_cdf((1 + level) / 2) * cov.diagonal(dim1=-2, dim2=-1)[rows, :2].sqrt().rad2deg()

@@ -26,13 +26,13 @@ from torch_denkf.modules import DiagonalNoise, SubModel
 from torch_denkf.smoothers import EnRTS, RTSSmoother
 
 SETTLED = 5.0  # s of a simulated run that are not scored
-STEADY = slice(50, 1168)  # rows of iCub's log that are scored; studies of its velocity leave the ends out, too
+STEADY = slice(50, 1168)  # rows of iCub's log that are scored, without its ends, as in studies of its velocity
 PULLS = (0.1, 0.2, 0.5, 1.0)  # 1/s; Mahony's integral gain is a twentieth of it
-#: In rad, of one reading: the accelerometer's direction is off while the body is pushed, for many rows in the same way.
+#: Rad, of one reading of the accelerometer's direction. They are large, because its errors last for many rows.
 UP_NOISES = (0.3, 0.5, 1.0, 2.0)
-#: In m/s, of one of ten readings a second that the body rests: a velocity lasts for many of them, too.
+#: m/s, of one of ten zero-velocity readings per second. They are large, because a velocity lasts for many of them.
 REST_NOISES = (1.0, 2.0, 3.0, 5.0)
-#: rad/s/sqrt(Hz): the data sheet's; of iCub set by us, because the times of its rows jitter by milliseconds.
+#: rad/s/sqrt(Hz): the data sheet's; for iCub set by us, because the times of its rows jitter by milliseconds.
 GYRO_NOISES = {"simulated": Sensors().gyro_noise, "iCub": 5e-3}
 LEVEL = 0.9  # of the intervals
 SCORES = ("tilt", "largest", "full", "claimed", "nees", "held", "ms")
@@ -50,27 +50,27 @@ FUSED = (
 
 @dataclass(frozen=True)
 class Study:
-    """Estimates which way is up, by a gyro and an accelerometer."""
+    """Estimates the tilt of a body from a gyro and an accelerometer."""
 
     out: Path | None = None  # folder for attitude.csv, attitude.md and attitude.png
-    icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing
+    icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; skipped if they are missing
     runs: int = 24  # simulated
     seconds: float = 20.0  # of a simulated run
     updates: int = 25  # of the learned noise
     seed: int = 0
-    only: str = ""  # run filters alone whose name begins so, with the settings of attitude.csv; other rows stay
+    only: str = ""  # run only filters whose name begins so, with the settings of attitude.csv; other rows stay
     data: tuple[Literal["simulated", "iCub"], ...] = ("simulated", "iCub")  # rows of the others stay, with only
     smoke: bool = False  # one short run: does it run?
 
 
 def scores(orientation: Tensor, data: TensorDict, rows: slice, cov: Tensor | None = None) -> dict[str, float]:
-    """Errors in degrees, and how they compare with what a filter claims.
+    """Returns errors in degrees, and their consistency with a filter's covariance.
 
     Args:
         orientation: ``[R, T, 4]``.
         data: with the true ``"orientation"``.
-        rows: that are scored.
-        cov: of the orientation's error ``[R, T, 3, 3]``, turns about the body's axes.
+        rows: to score.
+        cov: of the orientation's error ``[R, T, 3, 3]``, rotations about the body's axes.
 
     Returns:
         ``"tilt"`` and ``"full"``, root mean square errors of the tilt and of the orientation; ``"largest"``, of the
@@ -94,7 +94,7 @@ def scores(orientation: Tensor, data: TensorDict, rows: slice, cov: Tensor | Non
 
 
 def baseline_rows(name: str, data: TensorDict, rows: slice) -> Iterator[dict]:
-    """Of filters in plain numpy, which start from the true orientation of the first row and know of no bias."""
+    """Yields rows of filters in plain numpy, which start from the first row's true orientation and zero bias."""
     log = {key: data[key].double().numpy() for key in ("gyro", "accelerometer", "dt", "orientation")}
     inputs = log["gyro"], log["accelerometer"], log["dt"], log["orientation"][:, 0]
 
@@ -112,7 +112,7 @@ def baseline_rows(name: str, data: TensorDict, rows: slice) -> Iterator[dict]:
 
 
 def belief_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
-    """Orientations ``[R, T, 4]`` and their covariances ``[R, T, 3, 3]``, of moments or of members."""
+    """Returns orientations ``[R, T, 4]`` and their covariances ``[R, T, 3, 3]``, from moments or members."""
     mean = out[prefix, "mean"][..., :4]
     if "cov" in out[prefix]:
         return mean, out[prefix, "cov"][..., :3, :3]
@@ -122,7 +122,7 @@ def belief_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def run(model: nn.Module, data: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor, float]:
-    """Orientations, their covariances, and milliseconds of the processor a step of all runs at once."""
+    """Returns orientations, their covariances, and processor milliseconds per step of all runs at once."""
     torch.manual_seed(0)
     began = time.process_time()
     out = model.sequence(data.clone())
@@ -139,17 +139,17 @@ def library_rows(
     smoke: bool = False,
     only: str = "",
 ) -> Iterator[dict]:
-    """Yields rows of the library's filters and smoothers; an empty one for each whose name does not begin so.
+    """Yields rows of the library's filters and smoothers; an empty row for each name that ``only`` excludes.
 
     Args:
         name: of the data.
         data: of :func:`prepared`.
-        rows: that are scored.
+        rows: to score.
         up_noise: standard deviation of the accelerometer's direction, in rad.
-        rest_noise: of the velocity that is read to be zero, in m/s.
+        rest_noise: standard deviation of the zero-velocity reading, in m/s.
         learned: the noise of the accelerometer's direction that :func:`learned_noise` trained.
-        smoke: a few of them.
-        only: how the names of those begin that run.
+        smoke: run only a few of them.
+        only: first characters of the names to run.
     """
     gyro = GYRO_NOISES[name]
 
@@ -198,7 +198,7 @@ def library_rows(
 
 
 def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slice) -> float:
-    """The standard deviation with the least root mean square tilt; all are tried at once."""
+    """Returns the standard deviation with the least root mean square tilt; all are tried at once."""
     several = torch.cat([data] * len(noises))
     several["std"] = torch.tensor(noises).repeat_interleave(len(data)).reshape(-1, 1, 1).expand(*several.shape, 1)
     orientation, _, _ = run(make("EKF", GYRO_NOISES["simulated"], GivenNoise()), several)
@@ -209,7 +209,7 @@ def chosen(make: Callable, noises: Sequence[float], data: TensorDict, rows: slic
 
 
 def learned_noise(data: TensorDict, up_noise: float, updates: int, window: int = 250) -> DiagonalNoise:
-    """The noise of the accelerometer's direction by features of the reading, trained through the extended filter.
+    """Returns the accelerometer's direction noise as a network of the reading, trained through the EKF.
 
     The score is the CRPS of the tilt about x and about y, which are tangents at the filter's mean.
 
@@ -245,7 +245,7 @@ def learned_noise(data: TensorDict, up_noise: float, updates: int, window: int =
 
 
 def picture(data: TensorDict, pull: float, path: Path) -> None:
-    """Roll and pitch of iCub's walk: by an extended filter that reads the standing foot, and by Mahony's."""
+    """Draws roll and pitch of iCub's walk, by an EKF that reads the standing foot, and by Mahony's filter."""
     model = inertial_filter("EKF", GYRO_NOISES["iCub"], REST_NOISES[0], feet=True)
     orientation, cov, _ = run(model, prepared(data))
     log = [data[key].double().numpy() for key in ("gyro", "accelerometer", "dt", "orientation")]
@@ -254,9 +254,9 @@ def picture(data: TensorDict, pull: float, path: Path) -> None:
 
 
 def page(rows: list[dict], study: Study) -> str:
-    """The table."""
+    """Returns the results page."""
     lines = [
-        "# Which way is up",
+        "# Attitude from an inertial sensor",
         "",
         "Tilt is the angle between where up is and where it is thought to be; orientation is the angle of the whole "
         f"error, heading included. Root mean squares. Simulated: {study.runs} runs of {study.seconds:g} s, without "
@@ -264,7 +264,7 @@ def page(rows: list[dict], study: Study) -> str:
         f"filter's covariance, over its expectation: above 1 a filter is too sure. The {LEVEL:.0%} intervals are those "
         "of the tilt about x and about y.",
     ]
-    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "held", "ms a step")
+    titles = ("filter", "setting", "tilt, deg", "largest, deg", "orientation, deg", "NEES", "coverage", "ms per step")
     for data, reads in dict.fromkeys((row["data"], row["reads"]) for row in rows):
         lines += ["", f"## {data}: {reads}", "", *head(*titles)]
         for row in rows:
@@ -289,7 +289,7 @@ def page(rows: list[dict], study: Study) -> str:
 
 
 def found_settings(study: Study, settled: slice) -> tuple[float, float, DiagonalNoise]:
-    """Both settings by other runs, and the learned noise."""
+    """Returns both settings, chosen on other runs, and the learned noise."""
     others = study.runs // 3 + 1
     validation = prepared(simulated(others, study.seconds, study.seed + 1))
     up_noise = chosen(attitude_filter, UP_NOISES[-2:] if study.smoke else UP_NOISES, validation, settled)

@@ -21,7 +21,7 @@ DT = 0.01  # s, of a row
 GRAVITY = 9.81  # m/s^2
 FIELD = (0.0, 20.0, -44.0)  # microtesla in the world's axes, x east, y north, z up: as in central Europe
 _FINE = 10  # steps of the simulator in a row
-_BEARS = 60.0  # N, of a foot that stands
+_BEARS = 60.0  # N, least load of a standing foot
 #: Joints of iCub's log, in its order.
 _JOINTS = (
     "neck_pitch neck_roll neck_yaw torso_pitch torso_roll torso_yaw l_shoulder_pitch l_shoulder_roll l_shoulder_yaw "
@@ -47,7 +47,7 @@ class Sensors:
     magnetometer: float = 0.5  # microtesla; standard deviation of a reading
 
 
-#: A brick with sensors in its middle.
+#: A rigid body with the sensors at its centre.
 _BODY = f"""
 <mujoco>
   <option timestep="{DT / _FINE}" integrator="RK4" gravity="0 0 {-GRAVITY}" magnetic="{" ".join(map(str, FIELD))}"/>
@@ -68,13 +68,13 @@ _BODY = f"""
 
 
 def simulated(runs: int, seconds: float, seed: int, sensors: Sensors | None = None) -> TensorDict:
-    """A free body in MuJoCo, pushed and turned at random about a place, and what cheap sensors read of it.
+    """Returns simulated logs of a cheap inertial sensor on a free body, pushed and turned at random about a place.
 
-    Gyro and accelerometer read the mean over the time since the last row, the magnetometer the moment.
+    Gyro and accelerometer read the mean over the time since the last row, the magnetometer an instant.
 
     Args:
         runs: R.
-        seconds: of a run; T of them are rows of 0.01 s.
+        seconds: of a run; it has T rows of 0.01 s.
         seed: of motions and sensors.
         sensors: their errors.
 
@@ -101,15 +101,15 @@ def simulated(runs: int, seconds: float, seed: int, sensors: Sensors | None = No
 
 
 def walking(folder: Path) -> TensorDict:
-    """The humanoid iCub walks 1.5 m in 12 s, with motion capture as truth.
+    """Returns a log of the humanoid iCub, which walks 1.5 m in 12 s, with motion capture as truth.
 
     Args:
         folder: with ``walking.npz`` and ``model.urdf``.
 
     Returns:
         ``[1, T]``, in the axes of the robot's root: ``"imu"``, ``"gyro"``, ``"accelerometer"``; ``"dt"``, which varies;
-        the truth as ``"orientation"`` and ``"position"``. ``"leg"``: the velocity of the sensor in m/s, if the foot
-        that bears more stands still; of the joints and the gyro; ``"leg_observed"``, where it bears more than 60 N.
+        the truth as ``"orientation"`` and ``"position"``. ``"leg"``: the velocity of the sensor in m/s from joints and
+        gyro, if the foot that bears more stands still; ``"leg_observed"``: whether it bears more than 60 N.
     """
     with np.load(folder / "walking.npz") as file:
         log = {key: file[key] for key in file.files}
@@ -133,14 +133,14 @@ def walking(folder: Path) -> TensorDict:
 
 
 def tilt_error(orientation: Tensor, truth: Tensor) -> Tensor:
-    """The angle ``[*]`` in rad between where up is in the body's axes and where it is thought to be, of ``[*, 4]``."""
+    """Returns the angle ``[*]`` in rad between the true and the estimated vertical, from quaternions ``[*, 4]``."""
     up = torch.tensor([0.0, 0.0, 1.0]).to(truth)
     one, other = (rotate(SO3().inverse(each), up) for each in (orientation, truth))
     return torch.atan2(torch.linalg.cross(one, other).norm(dim=-1), (one * other).sum(-1))
 
 
 def _run(model: mujoco.MjModel, rows: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Returns what perfect sensors read, ``[T, 9]``, and position, velocity and orientation, ``[T, 10]``."""
+    """Returns noise-free readings ``[T, 9]``, and position, velocity and orientation ``[T, 10]``."""
     data = mujoco.MjData(model)
     quaternion = random.standard_normal(4)
     data.qpos[3:] = quaternion / np.linalg.norm(quaternion)
@@ -170,7 +170,7 @@ def _run(model: mujoco.MjModel, rows: int, random: np.random.Generator) -> tuple
 
 
 def _leg_velocity(urdf: Path, log: dict[str, np.ndarray], gyro: np.ndarray) -> np.ndarray:
-    """The velocity ``[T, 3]`` of the inertial sensor, in the axes of the root, as the standing leg tells it."""
+    """Returns the velocity ``[T, 3]`` of the inertial sensor from the standing leg, in the axes of the root."""
     tree = ElementTree.parse(urdf)
     for part in list(tree.iter()):
         for child in list(part):
@@ -196,7 +196,7 @@ def _leg_velocity(urdf: Path, log: dict[str, np.ndarray], gyro: np.ndarray) -> n
 
 
 def _of_rpy(angles: Tensor) -> Tensor:
-    """The quaternions of roll, pitch and yaw ``[*, 3]``, turns about x, then y, then z of the world."""
+    """Returns the quaternions of roll, pitch and yaw ``[*, 3]``: rotations about x, then y, then z of the world."""
     turns = [SO3().exp(angles[..., axis : axis + 1] * torch.eye(3).to(angles)[axis]) for axis in range(3)]
     return SO3().compose(turns[2], SO3().compose(turns[1], turns[0]))
 

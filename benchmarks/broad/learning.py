@@ -1,15 +1,15 @@
-"""Learns the numbers of ``torch_denkf.applications.imu``, three times without a third of the kinds: numbers.json.
+"""Learns the parameters of ``torch_denkf.applications.imu``, in three folds over the kinds of motion: numbers.json.
 
     python -m benchmarks.broad.learning --out benchmarks/broad/numbers.json
 
 The filter's equations run in C (``equations.c``, by the compiler ``cc``): five minutes of one core. The lag of the
 magnetometer and the latency of the readings are least squares. The place's field is the median over the trials. All
-other numbers are found by an evolution strategy that lowers, averaged over the trials, the total error plus the
+other parameters are found by an evolution strategy. It minimises, averaged over the trials, the total error plus the
 inclination error, in degrees, plus 0.3 times the negative logarithm of Student's density of heading and inclination;
 and on every second trial, with 6 axes, the inclination error plus 0.2 times the total error. Factors on the standard
-deviations then make the 90 % intervals hold 90 % of the rows; they are larger as far as factors of all other kinds are
-too small for a kind. The numbers for other kinds, ``all``, are geometric means of the three sets; ``anywhere``, the
-library's, are those with factors where the place's field is not known.
+deviations then set the coverage of the 90 % intervals to 90 %; they are larger if the factors from all other kinds are
+too small for a kind. The parameters for new kinds, ``all``, are geometric means of the three sets; ``anywhere``, the
+library's, has factors for an unknown field of the place.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from torch_denkf.functional.manifolds import SO3
 
 __all__ = ["Equations", "Rows", "beliefs", "learn", "minimised"]
 
-#: What the strategy changes; poles are three more. All others stay.
+#: Parameters that the strategy optimises, together with the three poles.
 FREE = (
     *("gyro", "gyro_rate", "gyro_walk", "motion", "motion_unrest", "accelerometer", "gyro_scale", "gyro_skew"),
     *("magnetic_bias", "magnetic_walk", "magnetometer", "magnetometer_rate", "field_walk"),
@@ -45,38 +45,38 @@ FREE = (
     *("lag_std", "lever", "lever_walk", "heading", "heading_scale", "heading_floor", "tilt_scale", "tilt_floor"),
 )
 START = ImuSettings()
-FIELD, LAG = 27, 29  # their places in a tangent
+FIELD, LAG = 27, 29  # indices in a tangent
 #: Kinds that are left out together.
 FOLDS = (
     ("attached magnet", "slow rotation", "fast translation"),
     ("stationary magnet", "tapping", "fast rotation"),
     ("phone vibration", "fast combined", "slow translation"),
 )
-LARGE = 0.15  # rad: errors beyond say nothing of the latency
+LARGE = 0.15  # rad: larger errors are not used to estimate the latency
 FREEDOM = 4.0  # of Student's t
 
 
 @dataclass(frozen=True)
 class Learning:
-    """Learns the numbers of the inertial sensor's filter."""
+    """Learns the parameters of the inertial sensor's filter."""
 
     data: Path = Path("../shared/data/broad")  # folder with .npz files of BROAD
     out: Path | None = None  # numbers.json
-    start: Path | None = None  # numbers.json of the same folds to go on from, else the library's defaults
+    start: Path | None = None  # numbers.json of the same folds to continue from, else the library's defaults
     generations: int = 22  # of the evolution strategy
     seed: int = 0
     smoke: bool = False  # one simulated trial, one generation
 
 
 class Rows:
-    """A trial's rows, as the equations in C read them.
+    """A trial's rows in the layout of the equations in C.
 
     Args:
         trial: with the truth.
-        settings: of which the lag and the block count.
-        every: so many blocks are scored.
-        six: whether the magnetometer is left out.
-        short: whether the rows behind the last that is scored are left out.
+        settings: of the filter; only the lag and the block are read.
+        every: one of so many blocks is scored.
+        six: whether the magnetometer is excluded.
+        short: whether rows after the last scored one are dropped.
     """
 
     def __init__(self, trial: Trial, settings: ImuSettings, every: int = 3, *, six: bool = False, short: bool = False):
@@ -111,7 +111,7 @@ class Equations:
 
         Args:
             rows: of the trial.
-            s: the numbers.
+            s: the filter's parameters.
             nine: whether the magnetometer is read.
         """
         numbers = [s.gyro, s.gyro_rate, s.gyro_walk, 2 * sum(s.poles), s.motion, s.motion_unrest, s.accelerometer]
@@ -136,9 +136,9 @@ def _pointer(array: ndarray) -> ctypes.c_void_p:
 
 
 def measures(run: Equations, rows: Rows, s: ImuSettings, *, nine: bool = True) -> dict:
-    """Returns root mean square errors in degrees, logarithms of Student's density, and by row the factors needed.
+    """Returns root mean square errors in degrees, the negative log density of Student's t, and the factors of each row.
 
-    These are factors on the variances of heading and inclination, such that the 90 % interval just holds the error.
+    The factors scale the variances of heading and inclination so that the 90 % interval just contains the error.
     """
     quaternion, cov, states = run(rows, s, nine=nine)
     found = SO3().plus(torch.as_tensor(quaternion[rows.scored]), rows.rate * s.latency)
@@ -155,7 +155,7 @@ def measures(run: Equations, rows: Rows, s: ImuSettings, *, nine: bool = True) -
     size = a * b - c * c
     two = np.degrees(2) ** 2 * (b * x * x + a * y * y - 2 * c * x * y) / size
     one, nu = heading**2 / variance, FREEDOM
-    own = variance - np.degrees(1) ** 2 * off[..., 2]  # without what the place says of the heading
+    own = variance - np.degrees(1) ** 2 * off[..., 2]  # without the part that comes from the place's field
     return {
         "heading_need": (heading**2 / 2.7055 - variance + own) / own,
         "tilt_need": two / 4.6052,
@@ -220,7 +220,7 @@ def latency(run: Equations, rows: Sequence[Rows], s: ImuSettings) -> float:
 
 
 def learn(run: Equations, trials: Sequence[Trial], generations: int, seed: int, start: ImuSettings) -> ImuSettings:
-    """Learns the numbers from some trials."""
+    """Learns the parameters from some trials."""
     plain = [Rows(trial, replace(start, lag=0.0)) for trial in trials]
     weights = [np.square(each.values[0]).sum() for each in plain]
     lags = [run(each, replace(start, lag_std=0.01))[2][-1, LAG] for each in plain]
@@ -243,12 +243,12 @@ def learn(run: Equations, trials: Sequence[Trial], generations: int, seed: int, 
 
 
 def calibrated(run: Equations, trials: Sequence[Trial], s: ImuSettings) -> ImuSettings:
-    """Returns the numbers with factors on the standard deviations that make the intervals hold 90 %."""
+    """Returns the settings with factors on the standard deviations for a coverage of 90 %."""
     found = [measures(run, Rows(trial, s, short=True), s) for trial in trials]
     kinds = [trial.kind for trial in trials]
     for name in ("heading", "tilt"):
         needs = [each[f"{name}_need"] for each in found]
-        strange = []  # needs of a kind, where the factor is one of all others
+        strange = []  # factors that a kind needs in addition to the factor from all other kinds
         for kind, need in zip(kinds, needs, strict=True):
             others = [each for its, each in zip(kinds, needs, strict=True) if its != kind]
             strange.append(need / factor(others or needs))
@@ -258,20 +258,20 @@ def calibrated(run: Equations, trials: Sequence[Trial], s: ImuSettings) -> ImuSe
 
 
 def factor(needs: Sequence[ndarray]) -> float:
-    """Returns what suffices for 90 % of the rows, where each trial counts the same."""
+    """Returns the factor that suffices for 90 % of the rows, with the same weight for each trial."""
     values, weights = np.concatenate(needs), np.concatenate([np.full(len(each), 1 / len(each)) for each in needs])
     order = np.argsort(values)
     return float(values[order][np.searchsorted(weights[order].cumsum(), LEVEL * len(needs))])
 
 
 def _means(sets: Sequence[ImuSettings]) -> dict:
-    """Returns geometric means of all numbers, but for the place."""
+    """Returns geometric means of all parameters except the place."""
     names = [name for name in asdict(sets[0]) if name != "place"]
     return {name: np.exp(np.mean(np.log([getattr(each, name) for each in sets]), 0)).tolist() for name in names}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Learns, and writes."""
+    """Learns the parameters, and writes them."""
     options = parse(Learning, arguments)
     run = Equations()
     if options.smoke:

@@ -1,4 +1,4 @@
-"""The peers: VQF (``pip install vqf``), Madgwick's and Mahony's filters (``pip install ahrs``), where installed.
+"""The peers, if installed: VQF (``pip install vqf``), Madgwick's and Mahony's filters (``pip install ahrs``).
 
     python -m benchmarks.broad.peers --out benchmarks/broad/peers.json
 
@@ -60,7 +60,7 @@ def gradient_filter(name: str, gain, trial: Trial, start: Tensor) -> Tensor:
     """Returns orientations of Madgwick's or Mahony's filter, 9 axes.
 
     Args:
-        name: which of the two.
+        name: ``"Madgwick"`` or ``"Mahony"``.
         gain: beta; or the proportional and the integral gain.
         trial: with the readings.
         start: orientation before the first reading ``[4]``.
@@ -82,7 +82,7 @@ def gradient_filter(name: str, gain, trial: Trial, start: Tensor) -> Tensor:
 
 
 def slower(trial: Trial, times: int = 4) -> Trial:
-    """Returns a trial with means of so many readings in their place, and the truth at the last."""
+    """Returns a trial with means over ``times`` readings, and the truth at the last of them."""
     count = len(trial.gyro) // times
     sensors = {
         name: getattr(trial, name)[: count * times].unflatten(0, (count, times)).mean(1)
@@ -95,7 +95,7 @@ def slower(trial: Trial, times: int = 4) -> Trial:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs each filter with each gain on each trial, and writes the best without each kind."""
+    """Runs each filter with each gain on each trial, and writes for each kind the best gain on all others."""
     options = parse(Peers, arguments)
     trials = list(map(slower, [simulated_trial()] if options.smoke else read_trials(options.data)))
     page: dict = {"command": command("broad.peers"), "gains": {}}

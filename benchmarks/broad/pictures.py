@@ -1,4 +1,4 @@
-"""Heading and inclination errors of one trial: the filter's with its intervals, VQF's beside them."""
+"""Heading and inclination errors of one trial: the filter's with its intervals, VQF's for comparison."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw(trial: Trial, found: Orientations, other: Tensor | None, path: Path, *,
         found: by the filter.
         other: orientations by VQF, ``[T, 4]``; ``None`` for none.
         path: PNG.
-        every: so many rows make a point.
+        every: draw one of so many rows.
     """
     rows = slice(None, None, every)
     truth = SO3().normalise(trial.orientation[rows])

@@ -27,7 +27,7 @@ NUMBERS = Path(__file__).parent / "numbers.json"
 HELD = ("heading", "inclination")
 SCORES = ("total", "heading", "inclination", "heading_held", "inclination_held", "heading_std")
 OWN, SMOOTH, SIX, VQF, VQF_SIX = "imu", "smoother (RTS) of imu", "imu, 6 axes", "VQF", "VQF, 6 axes"
-MOVED = ", latency removed"  # moved on by the learned latency; all others are as stamped
+MOVED = ", latency removed"  # extrapolated by the learned latency; all others are as stamped
 METHODS = (
     *(name + moved for moved in ("", MOVED) for name in (OWN, VQF, SIX, VQF_SIX)),
     *(SMOOTH + MOVED, "Madgwick", "Mahony", "gyro alone"),
@@ -47,11 +47,11 @@ class Study:
 
 
 class Runner:
-    """Runs the filter, 9 and 6 axes, and the smoother on trials: all that share their numbers in one batch.
+    """Runs the filter, 9 and 6 axes, and the smoother on a batch of trials with the same parameters.
 
     Args:
         smoother: whether the smoother runs, too.
-        equations: whether the equations in C run in the library's place.
+        equations: whether the equations in C run instead of the library.
     """
 
     def __init__(self, smoother: bool = True, equations: bool = False):
@@ -88,7 +88,7 @@ class Runner:
 
 
 def settings_for(kind: str, numbers: dict[str, dict]) -> tuple[str, ImuSettings]:
-    """Returns the numbers that were learned without a kind of motion; those of all for a kind that was not there."""
+    """Returns the parameters that were learned without a kind of motion; the set ``all`` for a new kind."""
     name = kind if kind in numbers else "all"
     return name, ImuSettings(**numbers[name])
 
@@ -100,8 +100,8 @@ def rows_of(
 
     Args:
         trial: with readings and truth.
-        own: the filter's orientations by method, moved on by the latency.
-        numbers: name of their numbers.
+        own: the filter's orientations by method, extrapolated by the latency.
+        numbers: name of the filter's set of parameters.
         settings: of the filter.
         gains: of Madgwick's and Mahony's filter, by kind.
     """
@@ -133,10 +133,10 @@ def rows_of(
 
 
 def by_gyro(trial: Trial, start: Tensor) -> Tensor:
-    """Returns orientations by the gyro alone, from what the first readings of all sensors say."""
+    """Returns orientations by the gyro alone, from an initial orientation."""
     found = torch.cat([start.unsqueeze(0), SO3().exp(trial.gyro[1:] / trial.rate)])
     reach = 1
-    while reach < len(found):  # products of all before, twice as many each time
+    while reach < len(found):  # cumulative products by doubling
         found = torch.cat([found[:reach], SO3().compose(found[:-reach], found[reach:])])
         reach *= 2
     return found

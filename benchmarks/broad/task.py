@@ -19,8 +19,8 @@ from torch_denkf.functional.manifolds import SO3, quaternion_product
 
 __all__ = ["LEVEL", "Trial", "first_orientation", "kind_of", "read_trials", "scores", "simulated_trial"]
 
-LEVEL = 0.9  # of the intervals
-_ONE, _TWO = 1.6449, 2.1460  # radii that hold LEVEL of a normal error with one and with two components
+LEVEL = 0.9  # nominal coverage of the intervals
+_ONE, _TWO = 1.6449, 2.1460  # radii with coverage LEVEL for a standard normal error of one and of two components
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Trial:
         magnetometer: ``[T, 3]`` in uT.
         orientation: true quaternion ``[T, 4]``, NaN where the cameras lost the sensor.
         scored: rows in which the sensor moves and the truth is known, ``[T]`` bool.
-        rate: readings a second.
+        rate: sampling rate in Hz.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Trial:
 
 
 def kind_of(name: str) -> str:
-    """Returns the kind of motion or disturbance that a file's name says.
+    """Returns the kind of motion or disturbance in a file's name.
 
     Example:
         >>> kind_of("05_undisturbed_slow_rotation_with_breaks_B"), kind_of("33_disturbed_attached_magnet_2cm")
@@ -108,7 +108,7 @@ def simulated_trial(seconds: float = 10.0, rate: float = 100.0, seed: int = 0) -
 
 
 def first_orientation(trial: Trial) -> Tensor:
-    """Returns the orientation ``[4]`` that the first readings of accelerometer and magnetometer say."""
+    """Returns the initial orientation ``[4]`` from the first readings of accelerometer and magnetometer."""
     readings = (each[:100] for each in (trial.gyro, trial.acceleration, trial.magnetometer))
     return imu_rows(ImuSettings(), *readings, rate=trial.rate)["start"][0, :4]
 
@@ -117,12 +117,12 @@ def scores(trial: Trial, quaternion: Tensor, std: Tensor | None = None) -> dict[
     """Returns the benchmark's errors in degrees, and the coverage of the 90 % intervals.
 
     With e the estimate times the inverse of the truth: total 2 acos |e_w|, heading 2 atan (e_z / e_w), inclination
-    2 acos sqrt(e_w^2 + e_z^2); root mean square over the rows that are scored.
+    2 acos sqrt(e_w^2 + e_z^2). Each is the root mean square over the scored rows.
 
     Args:
         trial: with the truth.
-        quaternion: ``[T, 4]``.
-        std: standard deviations about the world's axes ``[T, 3]`` in rad; ``None`` for an estimate without.
+        quaternion: estimate ``[T, 4]``.
+        std: standard deviations about the world's axes ``[T, 3]`` in rad; ``None`` gives no coverage.
     """
     rows = trial.scored
     truth = SO3().normalise(trial.orientation[rows])

@@ -22,7 +22,7 @@ class Timing:
     """Times the inertial sensor's filter on a simulated log."""
 
     readings: int = 55_000  # at 286 Hz
-    package: bool = True  # the step, too: needs a C++ compiler, and minutes
+    package: bool = True  # time the packaged step, too: needs a C++ compiler, and minutes
     smoke: bool = False  # a second of readings, and no package
 
 

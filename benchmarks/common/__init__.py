@@ -1,1 +1,1 @@
-"""Shares options, jobs, tables, recipes of filters, scores and pictures among the studies."""
+"""Options, jobs, tables, recipes of filters, scores and plots that the studies share."""

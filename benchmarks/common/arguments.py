@@ -20,7 +20,7 @@ CONFIG = (tyro.conf.FlagCreatePairsOff,)  # --smoke, and no --no-smoke
 
 
 def parse(options: type[T], arguments: Sequence[str] | None = None) -> T:
-    """The options of a command line; a field's comment is its help. Sets torch to one thread.
+    """Returns the options of a command line; a field's comment is its help. Sets torch to one thread.
 
     The matrices of the studies are small: more threads would only wait for each other.
     """
@@ -49,14 +49,14 @@ def run_one(commands: dict[str, type[Callable[[], None]]], arguments: Sequence[s
 
 
 def some_of(names: Iterable[str]) -> Any:
-    """The type of an option that takes some of these names."""
+    """Returns the type of an option that takes several of the names."""
     return tuple[Literal[tuple(names)], ...]
 
 
 def command(study: str) -> str:
-    """The command line that is running, for the record: ``python -m benchmarks.<study> ...``.
+    """Returns the command line that is running, for the record: ``python -m benchmarks.<study> ...``.
 
-    Absolute paths are written as seen from the repository's root, so that no folder of this machine is in the record.
+    Absolute paths become relative to the repository's root, so that the record has no folder of this machine.
     """
     return shlex.join(["python", "-m", f"benchmarks.{study}", *(_from_root(word) for word in sys.argv[1:])])
 
@@ -67,7 +67,7 @@ def _from_root(word: str) -> str:
 
 
 def processor() -> str:
-    """The processor's name, for the record."""
+    """Returns the processor's name, for the record."""
     info = Path("/proc/cpuinfo")
     for line in info.read_text().splitlines() if info.exists() else []:
         if line.startswith("model name"):
@@ -76,5 +76,5 @@ def processor() -> str:
 
 
 def made_by(study: str, more: str = "") -> list[str]:
-    """The last lines of a page: the command, and what is said of it; processor and torch."""
+    """Returns the last lines of a page: the command, followed by ``more``, processor and torch."""
     return [f"* Command: `{command(study)}`{more}.", f"* Hardware: {processor()}; torch {torch.__version__}."]

@@ -25,10 +25,10 @@ def minimise(
     Args:
         parameters: changed in place.
         loss: draws a batch and returns its loss.
-        updates: of the parameters.
-        rate: of learning.
+        updates: number of updates.
+        rate: learning rate.
         schedule: makes a schedule of the rate; ``None`` keeps it constant.
-        clip: largest norm of the gradient; ``None`` for any.
+        clip: largest norm of the gradient; ``None`` for no clipping.
         after: called with the number of each update, from 1 on.
     """
     parameters = list(parameters)

@@ -12,12 +12,12 @@ from scipy.stats import bootstrap
 def bootstrap_interval(
     values: Sequence[float], statistic: Callable[..., np.ndarray] = np.mean
 ) -> tuple[float, float, float]:
-    """A statistic, and the bounds of its 95 % percentile bootstrap interval.
+    """Returns a statistic, and the bounds of its 95 % percentile bootstrap interval.
 
-    The bounds are NaN where there is but one value, or all are the same.
+    The bounds are NaN if there is only one value, or all values are equal.
 
     Args:
-        values: one for each episode or seed; where two cases had the same ones, their paired differences.
+        values: one for each episode or seed; for two cases with the same ones, their paired differences.
         statistic: takes ``axis``.
     """
     center = float(statistic(values))

@@ -1,4 +1,4 @@
-"""Jobs of a study: side by side, each done once, their rows left on disk."""
+"""Runs the jobs of a study in parallel, each once, and saves their rows."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from torch_denkf.deployment.workers import follow_parent
 
 
 def once(file: Path, rows: Callable[[], list[dict]]) -> None:
-    """Computes rows and leaves them in a JSON file, unless it is there: a study that was broken off goes on."""
+    """Computes rows and saves them in a JSON file, unless it exists: an interrupted study resumes."""
     if file.exists():
         return
     write_text(file, json.dumps(rows()))
 
 
 def same_settings(out: Path, settings: dict) -> None:
-    """Leaves settings in ``out/settings.json``; a study that goes on there needs the same.
+    """Saves settings in ``out/settings.json``; a study that resumes in this folder needs the same settings.
 
     Raises:
-        SystemExit: if others are there; names them.
+        SystemExit: if the folder has other settings; names them.
     """
     file, settings = out / "settings.json", json.loads(json.dumps(settings, default=str))
     if not file.exists():
@@ -40,7 +40,7 @@ def same_settings(out: Path, settings: dict) -> None:
 
 
 def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: str) -> None:
-    """Makes all calls, each in one of some fresh processes, which end with this one; raises what a call raised."""
+    """Runs all calls in a pool of new processes, which end with this one; an exception of a call is raised here."""
     if processes < 2:
         for call in tqdm(calls, desc=title, disable=None):
             call()
@@ -58,7 +58,7 @@ def side_by_side(calls: Sequence[Callable[[], object]], processes: int, title: s
 
 
 def compute(jobs: Mapping[Path, Callable[[], list[dict]]], processes: int, title: str) -> list[dict]:
-    """The rows of all jobs, each of which leaves them in a file; those that are there are not computed again."""
+    """Runs all jobs and returns their rows; each job saves its rows in a file, which a resumed run reads."""
     side_by_side([partial(_alone, file, rows) for file, rows in jobs.items()], processes, title)
     return read_rows(jobs)
 
@@ -69,11 +69,11 @@ def _alone(file: Path, rows: Callable[[], list[dict]]) -> None:
 
 
 def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda row: None) -> list[dict]:
-    """All rows of some JSON files.
+    """Returns all rows of some JSON files.
 
     Args:
         files: in the order of their rows.
-        shared: what makes a row the same as another file's, or ``None``; the first file's are kept.
+        shared: key by which rows of several files are duplicates, or ``None``; those of the first file are kept.
 
     Raises:
         ValueError: if a file is damaged; names it.
@@ -92,5 +92,5 @@ def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda
 
 
 def rows_in(out: Path) -> list[dict]:
-    """All rows that a study's folder holds, in ``out/rows``."""
+    """Returns all rows in the folder ``out/rows`` of a study."""
     return read_rows(sorted((out / "rows").glob("*.json")))

@@ -13,7 +13,7 @@ from torch_denkf._checks import check_number
 
 
 def lorenz96_tendency(state: Tensor, forcing: float | Tensor = 8.0) -> Tensor:
-    """Time derivative dx_i/dt = (x_{i+1} − x_{i−2}) x_{i−1} − x_i + F, on a circle.
+    """Returns the time derivative dx_i/dt = (x_{i+1} − x_{i−2}) x_{i−1} − x_i + F, on a circle.
 
     Args:
         state: x, ``[..., N]`` with N >= 4, without units.
@@ -32,13 +32,13 @@ def lorenz96_tendency(state: Tensor, forcing: float | Tensor = 8.0) -> Tensor:
     """
     if state.ndim < 1 or state.shape[-1] < 4:
         raise ValueError(f"state must be [..., N] with N >= 4 variables, got {list(state.shape)}")
-    # The circle closed by hand, once: three rolls cost more than the rest of the formula.
+    # One concatenation closes the circle: three rolls cost more than the rest of the formula.
     circle = torch.cat([state[..., -2:], state, state[..., :1]], -1)
     return (circle[..., 3:] - circle[..., :-3]) * circle[..., 1:-2] - state + forcing
 
 
 def lorenz96_step(state: Tensor, dt: float = 0.05, forcing: float | Tensor = 8.0) -> Tensor:
-    """One step of the classical fourth-order Runge-Kutta scheme.
+    """Returns one step of the classical fourth-order Runge-Kutta scheme.
 
     Args:
         state: x, ``[..., N]`` with N >= 4, without units.

@@ -1,4 +1,4 @@
-"""Bars for the pages of results, drawn from the studies' rows: ``python -m benchmarks.common.overview``."""
+"""Draws bar charts for the pages of results from the studies' rows: ``python -m benchmarks.common.overview``."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from benchmarks.common.plots import plt, save
 ENDS = ("first", "last")
 STUDIES = Path(__file__).parents[1]
 PAGES = STUDIES.parent / "docs" / "results"
-Bars = tuple[str, pd.DataFrame]  # the axis' label; numbers of each series, by what a row is
+Bars = tuple[str, pd.DataFrame]  # the axis' label; a column for each series, a row for each group of bars
 
 
 def smoothing() -> Bars:
-    """Error of filter and smoother on chaotic systems; methods without a smoother are left out."""
+    """Returns the error of filter and smoother on chaotic systems, without methods that have no smoother."""
     rows = pd.read_csv(STUDIES / "smoothing/results/smoothing.csv").dropna(subset="rmse_smoother")
     lags = rows["lag"].map(", lag {:.0f}".format, na_action="ignore").fillna("")
     names = rows["system"] + ", " + rows["method"] + lags
@@ -27,7 +27,7 @@ def smoothing() -> Bars:
 
 
 def fusion() -> Bars:
-    """Error on KITTI while a sensor fails, median over the trainings."""
+    """Returns the error on KITTI while a sensor fails, median over the trainings."""
     rows = pd.read_csv(STUDIES / "fusion/results/fusion.csv").query("task == 'KITTI'").dropna(subset="error_without")
     medians = rows.pivot_table(["error", "error_without"], "condition", "method", "median", sort=False)
     bars = {"plain": medians["error", "plain"], "weights": medians["error", "weights"]}
@@ -36,7 +36,7 @@ def fusion() -> Bars:
 
 
 def monitor() -> Bars:
-    """Error of the path's end, alone and with an answer to the signs."""
+    """Returns the end-point error, with and without the monitor's response."""
     rows = pd.read_csv(STUDIES / "monitor/results/monitor.csv").dropna(subset="m_per_m")
     faults = rows["fault"].map({"none": "no fault", "black-all": "30 % black", "box-all": "a box"})
     names = rows["task"].str.removeprefix("kitti-") + ": " + faults
@@ -45,7 +45,7 @@ def monitor() -> Bars:
 
 
 def arms() -> Bars:
-    """Mean distance of an arm's tip from its goal."""
+    """Returns the mean distance of an arm's tip from its goal."""
     rows = pd.read_csv(STUDIES / "arms/results/table.csv")
     missing = rows["missing"].map(lambda share: f", {share:.0%} missing" if share else "")
     tips = rows.groupby([rows["task"] + ", " + rows["source"] + missing, "estimate"], sort=False)["tip"].mean()
@@ -53,23 +53,22 @@ def arms() -> Bars:
 
 
 def odometry() -> Bars:
-    """Length of the path over the true length, mean over the drives."""
+    """Returns the estimated over the true path length, mean over the drives."""
     scales = pd.read_csv(STUDIES / "odometry/results/odometry.csv").groupby("height_m")["scale"].mean()
     return "length of the path / true length", scales.rename(index="height {:g} m".format).to_frame("path")
 
 
 def reliability() -> Bars:
-    """Error of packaged steps in the first and in the last chunk of a million."""
+    """Returns the error of packaged steps in the first and in the last chunk of a million."""
     rows = json.loads((STUDIES / "reliability/results/soak.json").read_text())["parts"]["steps"]
     bars = {f"{at} steps": {row["name"]: row[f"mean squared error, {at} chunk"] for row in rows} for at in ENDS}
     return "mean squared error", pd.DataFrame(bars)
 
 
 def speed() -> Bars:
-    """Time of a compiled sequence over that of a peer."""
+    """Returns the time of a compiled sequence divided by that of a peer."""
     rows = pd.DataFrame(json.loads((STUDIES / "speed/results/speed.json").read_text()))
     found = rows["name"].str.extract(r"^compiled (?P<what>.+ / .+), B=(?P<size>.+)$").join(rows["ratio"]).dropna()
-    found = found[~found["what"].str.contains("floor")]
     bars = found.pivot(index="what", columns="size", values="ratio").loc[found["what"].unique(), found["size"].unique()]
     return "our time / theirs", bars.add_suffix(" at a time")
 
@@ -92,7 +91,7 @@ def draw(label: str, bars: pd.DataFrame, file: Path) -> None:
 
 
 def main(folder: Path = PAGES) -> None:
-    """Draws each picture into a folder."""
+    """Draws each chart into a folder."""
     for study in DRAWN:
         draw(*study(), folder / f"{study.__name__}.png")
 

@@ -1,4 +1,4 @@
-"""Shares the pictures of the studies. matplotlib draws without a window."""
+"""Plots that several studies share. matplotlib draws without a window."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def draw_frontier(
     time: str = "ms_per_step",
     limit: float | None = None,
 ) -> None:
-    """Draws error against milliseconds a step: one line a filter, a dot for each of its numbers of members.
+    """Draws error against milliseconds per step: a line for each filter, a dot for each ensemble size.
 
     Args:
-        rows: with ``"filter"``, ``"members"``, the error and the time; the number is written beside the first and the
-            last dot of a line.
+        rows: with ``"filter"``, ``"members"``, the error and the time; the first and the last dot of a line are
+            labelled with the members.
         path: PNG.
         error: column of the error.
         label: of its axis.
         time: column of the milliseconds.
-        limit: rows with a larger error are left out; the title says how many.
+        limit: rows with a larger error are not drawn; the title has their count.
 
     Raises:
         ValueError: without rows.
@@ -48,8 +48,8 @@ def draw_frontier(
         for end in (0, -1) if len(own) > 1 else ():
             axis.annotate(str(own[end]["members"]), points[end], (4, 4), textcoords="offset points", fontsize=8)
     errors = [row[error] for row in kept]
-    wide = max(errors) > 2 * min(errors)  # less shows hardly a label on a logarithmic scale
-    axis.set(xscale="log", yscale="log" if wide else "linear", xlabel="ms a step, one thread", ylabel=label)
+    wide = max(errors) > 2 * min(errors)  # a logarithmic scale has too few labels in a narrower range
+    axis.set(xscale="log", yscale="log" if wide else "linear", xlabel="ms per step, one thread", ylabel=label)
     for scale in (axis.xaxis, axis.yaxis) if wide else (axis.xaxis,):
         scale.set_major_formatter("{x:g}")
         scale.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")

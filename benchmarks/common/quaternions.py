@@ -1,4 +1,4 @@
-"""Quaternions in plain numpy, w first: what a filter of an attitude takes when it shares nothing with the library.
+"""Quaternions in plain numpy, w first, for attitude filters that share no code with the library.
 
 Source: Solà 2017, arXiv:1711.02508.
 """
@@ -18,7 +18,7 @@ def product(a: ndarray, b: ndarray) -> ndarray:
 
 
 def exp(angles: ndarray) -> ndarray:
-    """Maps turns in rad about the axes, ``[*, 3]``, to quaternions."""
+    """Maps rotation vectors in rad, ``[*, 3]``, to quaternions."""
     half = np.linalg.norm(angles, axis=-1, keepdims=True) / 2
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * angles], -1)
 
@@ -30,7 +30,7 @@ def matrix(q: ndarray) -> ndarray:
 
 
 def right_jacobian(angles: ndarray) -> ndarray:
-    """Returns the right Jacobian of small turns, up to the fourth power."""
+    """Returns the right Jacobian of small rotations, up to the fourth power."""
     cross, square = skew(angles), (angles**2).sum(-1)[..., None, None]
     return np.eye(3) - (1 / 2 - square / 24) * cross + (1 / 6 - square / 120) * cross @ cross
 

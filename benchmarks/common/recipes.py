@@ -1,4 +1,4 @@
-"""Recipes: how a study composes, trains and tunes one kind of filter. The base of both studies' recipes."""
+"""Recipes, which compose, train and tune one kind of filter in a study, and the base classes of all recipes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ R = TypeVar("R", bound=type)
 
 
 class Registry(dict[str, type]):
-    """Recipes by name: a class's own in lower case."""
+    """Recipes by the name of their class in lower case."""
 
     def register(self, recipe: R) -> R:
         """Makes a filter available to all commands of the study; use it as a decorator."""
@@ -39,10 +39,10 @@ class Recipe:
     """Composes, trains and tunes one filter. All filters of a study read the same sensor.
 
     Attributes:
-        dims: the dimensions of the state that count, in scores and losses.
-        unit: what counts as an error of one in each of them, ``[len(dims)]``.
-        encoding: how many features the noise of a reading is learned from.
-        observation_key: what is compared with the predicted reading.
+        dims: dimensions of the state in scores and losses.
+        unit: of the error in each of them, ``[len(dims)]``.
+        encoding: number of features that the noise of a reading is learned from.
+        observation_key: the reading to compare with the predicted one.
     """
 
     observation_key: NestedKey = ("sensor", "ensemble")
@@ -52,51 +52,51 @@ class Recipe:
     encoding: int
 
     def modules(self) -> OrderedDict[str, TensorDictModuleBase]:
-        """Everything behind the sensor, by name, in order."""
+        """Returns all modules except the sensor by name, in order."""
         raise NotImplementedError
 
     def readings(self) -> OrderedDict[str, TensorDictModuleBase]:
-        """Modules between forecast and reading; none by default."""
+        """Returns modules between transition and observation; none by default."""
         return OrderedDict()
 
     def noise(self) -> SubModel:
-        """R, from what the sensor saw."""
+        """Returns the measurement noise R, from the sensor's encoding."""
         raise NotImplementedError
 
     def observation(self) -> SubModel:
-        """H."""
+        """Returns the measurement model."""
         raise NotImplementedError
 
     def loss(self, model: Filter) -> nn.Module:
-        """Returns what the training minimises, on windows with the true state: by default a Gaussian belief's score."""
+        """Returns the training loss on windows with the true state: by default the score of a Gaussian belief."""
         return GaussianLoss(model, sensor=0.0, dims=self.dims, state_scale=self.unit)
 
     def set_inflation(self, model: Filter, factor: float) -> None:
-        """Sets the one number that is chosen on the validation data: by default a factor on all noise."""
+        """Sets the inflation, which is chosen on validation data: by default a factor on all noise."""
         for module in model.modules():
             if isinstance(module, self.scaled):
                 module.factor = factor
 
     @property
     def state_scale(self) -> Tensor:
-        """Units of an ensemble's loss, ``[S]``: infinite where the state does not count."""
+        """Returns the units of an ensemble's loss, ``[S]``: infinite for components without a weight in it."""
         raise NotImplementedError
 
     def ensemble_loss(self, model: Filter) -> DEnKFLoss:
-        """The fair CRPS of forecast and belief; a score is the mean over what counts."""
+        """Returns the fair CRPS of forecast and belief, averaged over the components with finite units."""
         share = self.state_scale.isfinite().float().mean().item()
         return DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=self.state_scale)
 
 
 class Particles(Recipe):
-    """Weighted particles; the likelihood of a reading is a Gaussian or learned, ``learned`` being its bound."""
+    """Particle filters; the likelihood of a reading is Gaussian, or learned with the bound ``learned``."""
 
     particles = 100  # as Jonschkowski et al. and Kloss et al. train with
     resampling, learned = "soft", None
     likelihood_keys: ClassVar[dict[str, NestedKey]] = {}
 
     def noisy_motion(self) -> SubModel:
-        """The motion with its noise."""
+        """Returns the motion with its noise."""
         raise NotImplementedError
 
     def modules(self):

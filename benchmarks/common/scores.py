@@ -1,4 +1,4 @@
-"""Scores that several studies take of sensors and beliefs, and what a filter costs."""
+"""Scores of sensors and beliefs that several studies use, and the cost of a filter."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from torch_denkf.functional import crps_ensemble, crps_gaussian
 
 
 def counted(out: TensorDict, dims: Sequence[int], floor: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Means and variances of a belief ``[*K, T]`` and the truth, ``[*K, T - 1, D]``: the first row is given.
+    """Returns means and variances of a belief ``[*K, T]`` and the truth, ``[*K, T - 1, D]``: the first row is given.
 
     Args:
         out: with ``("belief", "mean")``, ``("belief", "var")`` and ``"state"``.
         dims: D dimensions of the state.
-        floor: least variance: particles that are all the same have none, and no likelihood.
+        floor: least variance: identical particles have zero variance, and no likelihood.
     """
     values = out["belief", "mean"], out["belief", "var"], out["state"]
     mean, variance, truth = (value[..., 1:, list(dims)] for value in values)
@@ -27,13 +27,13 @@ def counted(out: TensorDict, dims: Sequence[int], floor: float) -> tuple[Tensor,
 
 
 def belief_crps(out: TensorDict, dims: Sequence[int], unit: Tensor, floor: float) -> Tensor:
-    """CRPS of beliefs taken for Gaussians, in units, ``[*K, T - 1, D]``."""
+    """Returns the CRPS of beliefs, approximated by Gaussians, in units, ``[*K, T - 1, D]``."""
     return crps_gaussian(*counted(out, dims, floor)) / unit
 
 
 @torch.no_grad()
 def cost(model: Filter, run: Callable[[], object], steps: int) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of a run without it: the least of three runs."""
+    """Returns the number of parameters without the sensor, and milliseconds per step: the least of three runs."""
     parameters = {id(p): p.numel() for name, p in model.named_parameters() if not name.startswith("module.sensor.")}
     seconds = []
     for _ in range(3):
@@ -45,7 +45,7 @@ def cost(model: Filter, run: Callable[[], object], steps: int) -> dict[str, floa
 
 @torch.no_grad()
 def processor_ms(run: Callable[[], object], steps: int, runs: int = 10) -> float:
-    """Milliseconds of the processor a step, which other jobs hardly change: the least of some runs after a first."""
+    """Returns processor milliseconds per step, which depend little on other jobs: the least of some warm runs."""
     run()
     seconds = []
     for _ in range(runs):
@@ -56,11 +56,11 @@ def processor_ms(run: Callable[[], object], steps: int, runs: int = 10) -> float
 
 
 class SensorLoss(nn.Module):
-    """CRPS of a sensor's samples against what it should read, in units of a good sensor's errors.
+    """CRPS of a sensor's samples against the true reading, in units of a good sensor's errors.
 
     Args:
         sensor: reads frames.
-        target: what it should read of frames ``[N]``: ``[N, O]``.
+        target: maps frames ``[N]`` to true readings ``[N, O]``.
         unit: ``[O]``.
         terms: dimensions of each loss, by name.
     """
@@ -73,7 +73,7 @@ class SensorLoss(nn.Module):
         self.register_buffer("unit", unit)
 
     def forward(self, frames: TensorDict) -> dict[str, Tensor]:
-        """Scores frames ``[N]``, of which those count that are observed."""
+        """Scores the observed ones of frames ``[N]``."""
         score = crps_ensemble(self.sensor(frames)["sensor", "ensemble"], self.target(frames)) / self.unit
         if "observed" in frames:
             score = score[frames["observed"].squeeze(-1)]

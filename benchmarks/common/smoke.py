@@ -1,12 +1,12 @@
-"""A tiny run of every example and short study, two side by side; of long studies, too, by ``--all``.
+"""Runs every example and short study at tiny size, two in parallel; with ``--all`` also the long studies.
 
 ``python -m benchmarks.common.smoke``
 
-What they share is imported once, and each run is a fork of this process: otherwise the imports take longer than most of
-the runs.
+Shared imports run once, and each run is a fork of this process: otherwise the imports take longer than most of the
+runs.
 """
 
-# ruff: noqa: F401  # imports that nearly all programs share
+# ruff: noqa: F401  # imports of nearly all programs
 from __future__ import annotations
 
 import os
@@ -32,14 +32,14 @@ import torch_denkf.plots
 import torch_denkf.training
 
 ROOT = Path(__file__).parents[2]
-#: Studies whose tiny runs take longest: they come first.
+#: Studies with the longest tiny runs, which start first.
 LONG = ("monitor", "ur5", "control", "kitti", "g1", "lorenz96", "reliability", "sequence07", "legged", "legged.policy")
-ELSEWHERE = ("speed",)  # needs the libraries that it compares with, see tests/benchmarks/test_speed.py
+ELSEWHERE = ("speed",)  # needs the compared libraries, see tests/benchmarks/test_speed.py
 SIDE_BY_SIDE = 2
 
 
 def programs() -> list[str]:
-    """Modules and files."""
+    """Returns the names of modules and the paths of files to run."""
     found = {file.parent.name for file in ROOT.glob("benchmarks/*/__main__.py")} - set(ELSEWHERE)
     studies = [*(LONG if "--all" in sys.argv else ()), *sorted(found - set(LONG))]
     return [f"benchmarks.{name}" for name in studies] + sorted(
@@ -48,7 +48,7 @@ def programs() -> list[str]:
 
 
 def run(program: str) -> None:
-    """Runs a program, as if it had been started by itself."""
+    """Runs a program as ``__main__``."""
     sys.argv = [program, "--smoke"]
     if program.endswith(".py"):
         sys.path.insert(0, str(ROOT / "examples"))
@@ -58,7 +58,7 @@ def run(program: str) -> None:
 
 
 def start(program: str, log: IO[bytes]) -> int:
-    """A process of its own, whose output goes to a file; its number."""
+    """Runs a program in a new process, whose output goes to a file; returns its id."""
     sys.stdout.flush()
     process = os.fork()
     if process:
@@ -74,18 +74,18 @@ def start(program: str, log: IO[bytes]) -> int:
 
 
 def main() -> None:
-    """Runs all; prints what each said, and ends with an error if one failed. What they leave is deleted."""
+    """Runs all programs, prints their outputs, and deletes their files; exits with an error if one failed."""
     folder, own = tempfile.mkdtemp(), os.getpid()
     os.environ["TMPDIR"] = tempfile.tempdir = folder
     try:
         run_all()
     finally:
-        if os.getpid() == own:  # a fork leaves by here, too
+        if os.getpid() == own:  # a fork gets here, too
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def run_all() -> None:
-    """Runs all, two side by side."""
+    """Runs all programs, two in parallel."""
     waiting, running, failed = programs(), {}, []
     while waiting or running:
         while waiting and len(running) < SIDE_BY_SIDE:

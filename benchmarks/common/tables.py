@@ -11,17 +11,17 @@ from torch_denkf.deployment.files import replacing, write_text
 
 
 def pick(rows: Iterable[dict], **wanted) -> list[dict]:
-    """Rows with these entries."""
+    """Returns rows with these entries."""
     return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
 
 
 def line(*cells: object) -> str:
-    """A line of a Markdown table."""
+    """Returns a line of a Markdown table."""
     return f"| {' | '.join(map(str, cells))} |"
 
 
 def head(*titles: object) -> list[str]:
-    """The two lines that a Markdown table begins with."""
+    """Returns the first two lines of a Markdown table."""
     return [line(*titles), "|" + "---|" * len(titles)]
 
 
@@ -34,7 +34,7 @@ def markdown(frame: pd.DataFrame) -> list[str]:
 def write_table(
     rows: Iterable[dict], file: Path, order: Sequence[str], columns: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """Writes rows as CSV with five digits, sorted by some columns if any; returns them as they are there."""
+    """Writes rows as CSV with five digits, sorted by some columns if any; returns them as written."""
     frame = pd.DataFrame(rows, columns=columns).convert_dtypes()
     present = [key for key in order if key in frame]
     frame = frame.sort_values(present, kind="stable") if present else frame
@@ -44,13 +44,13 @@ def write_table(
 
 
 def records(file: Path) -> list[dict]:
-    """Rows of a CSV, without what is empty; none where there is no file."""
+    """Returns rows of a CSV without its empty cells; no rows if there is no file."""
     rows = pd.read_csv(file).to_dict("records") if file.exists() else []
     return [{key: value for key, value in row.items() if pd.notna(value)} for row in rows]
 
 
 def write_page(page: str, file: Path | None) -> None:
-    """Prints a page, and leaves it in a file if one is given."""
+    """Prints a page, and writes it to a file if one is given."""
     print("\n" + page)
     if file is not None:
         write_text(file, page)
@@ -64,7 +64,7 @@ def report(
     order: Sequence[str] = (),
     columns: Sequence[str] | None = None,
 ) -> None:
-    """Prints a page; leaves it and the rows as NAME.md and NAME.csv in a folder if one is given."""
+    """Prints a page; writes it and the rows as NAME.md and NAME.csv in a folder if one is given."""
     if folder is not None:
         write_table(rows, folder / f"{name}.csv", order, columns)
     write_page(page, None if folder is None else folder / f"{name}.md")

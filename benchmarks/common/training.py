@@ -1,4 +1,4 @@
-"""The training of a filter in stages, and then of its one number."""
+"""Trains a filter in stages, and then chooses its inflation."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def fit_filter(
     notes: dict | None = None,
     **settings,
 ) -> None:
-    """Trains a filter, then chooses its inflation; or reads both from ``out/filter.pt`` where that was done.
+    """Trains a filter, then chooses its inflation; loads both from ``out/filter.pt`` if the file exists.
 
     Args:
         recipe: the model's.
-        model: trained in place; it is left on its best parameters.
+        model: trained in place; it ends with its best parameters.
         stages: makes the stages.
         coverage: of the model's 90 % intervals on validation data, by which the inflation is chosen.
-        out: checkpoints and logs.
+        out: folder for checkpoints and logs.
         inflations: to choose from.
-        error: of the model on validation data, by which the inflation is chosen where there is no coverage.
-        notes: plain values and tensors to leave in the file, too.
+        error: of the model on validation data; if given, the inflation is chosen by it instead of the coverage.
+        notes: plain values and tensors to save in the file, too.
         **settings: of :class:`~torch_denkf.training.FilterTrainer`.
     """
     file = out / "filter.pt"
@@ -61,12 +61,12 @@ def fit_filter(
 
 
 def read_filter(recipe: Recipe, model: Filter, saved: dict) -> Filter:
-    """The model with the parameters and the inflation of a ``filter.pt``."""
+    """Returns the model with the parameters and the inflation of a ``filter.pt``."""
     model.load_state_dict(saved["model"])
     recipe.set_inflation(model, saved["inflation"])
     return model
 
 
 def random_rows(rows: TensorDict, batch: int) -> Callable[[torch.Generator, int | None], TensorDict]:
-    """Returns a stage's ``sample``: so many of the rows ``[N]``."""
+    """Returns a stage's ``sample``, which draws ``batch`` of the rows ``[N]``."""
     return lambda generator, length: rows[torch.randint(len(rows), (batch,), generator=generator)]

@@ -1,1 +1,1 @@
-"""Policies that read a belief, against policies that remember: a mountain hike, a pendulum and a cartpole."""
+"""Compares policies on a belief with policies with memory: a mountain hike, a pendulum and a cartpole."""

@@ -1,4 +1,4 @@
-"""The arms: what each reads."""
+"""The arms of the study, and their inputs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ MEMORY = 64  # units of an LSTM
 
 @dataclass(frozen=True)
 class Arm:
-    """Holds what an arm reads.
+    """Input of an arm's policy.
 
     Attributes:
         key: entry of the environment.
-        stack: readings side by side.
-        memory: whether an LSTM remembers what was seen.
+        stack: number of stacked readings.
+        memory: whether the policy has an LSTM.
         filter: ``"learned"`` from readings, ``"taught"`` with the simulator's states, ``"exact"``, or nothing.
         end_to_end: whether the loss of the actor trains the filter, too.
     """
@@ -49,12 +49,12 @@ ARMS = {
 
 @dataclass(frozen=True)
 class Inputs:
-    """Sizes and units of what an arm's networks read and write.
+    """Sizes and units of the inputs and outputs of an arm's networks.
 
     Attributes:
-        seen: width of the entry, of arms that read it.
+        seen: width of the entry ``"seen"``, for arms that read it.
         actions: A.
-        scale: what a state is divided by, ``[S]``.
+        scale: divides a state, ``[S]``.
         limit: of an action.
     """
 
@@ -65,7 +65,7 @@ class Inputs:
 
 
 def memory(width: int, name: str) -> LSTMModule:
-    """An LSTM of torchrl's on what is seen."""
+    """Returns one of torchrl's LSTMs on the entry ``"seen"``."""
     states = [f"{name}_hidden", f"{name}_cell"]
     keys = {"in_keys": ["seen", *states], "out_keys": [f"{name}_memory", *(("next", key) for key in states)]}
     return LSTMModule(input_size=width, hidden_size=MEMORY, **keys)
@@ -83,10 +83,10 @@ def reader(arm: Arm, inputs: Inputs, name: str) -> tuple[list[LSTMModule], Neste
 class Seen(Transform):
     """Writes ``"seen"`` ``[*B, O + 1 + A]``: the last reading that came, whether it came now, and the last action.
 
-    All that a filter reads in a step, without NaN.
+    These are all inputs of a filter in a step, without NaN.
 
     Args:
-        scale: what a reading is divided by, a number or ``[O]``.
+        scale: divides a reading, a number or ``[O]``.
     """
 
     def __init__(self, scale: Tensor | float = 1.0):

@@ -1,4 +1,4 @@
-"""dm_control's cartpole, swung up from noisy readings; filters that learn it or know it."""
+"""Swing-up of dm_control's cartpole from noisy readings, and filters with learned or with known dynamics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch_denkf.envs import LinearGaussianEnv
 from torch_denkf.filters import DEnKF
 from torch_denkf.functional.draws import exact_draws
 
-REPEAT, STEPS = 4, 250  # physics steps of 0.01 s that an action is held for; actions in an episode
+REPEAT, STEPS = 4, 250  # physics steps of 0.01 s per action; actions in an episode
 DT = 0.01 * REPEAT  # s
 ACTION_NOISE, START_STD = 0.3, 0.01
 START = (0.0, -1.0, 0.0, 0.0, 0.0)  # the cart in the middle, the pole hanging
@@ -26,7 +26,7 @@ TRACK = 1.8  # m from the middle
 
 
 class NoisyCartpole(LinearGaussianEnv):
-    """Many carts at once. The state is the cart's position, cosine and sine of the pole's angle, and two velocities.
+    """A batch of cartpoles. The state is the cart's position, cosine and sine of the pole's angle, and two velocities.
 
     Physics, reward and start are those of ``dm_control.suite.cartpole.swingup``. Entries of the state (m, 1, 1, m/s,
     rad/s) are read with noise: the first three, or with the velocities all five, which dm_control's own observation
@@ -36,10 +36,10 @@ class NoisyCartpole(LinearGaussianEnv):
     Args:
         count: carts.
         noise: standard deviation of a reading.
-        missing: share of the readings that do not come.
+        missing: share of missing readings.
         seed: of the environment's own generator.
-        action_noise: standard deviation of what is added to an action, in each physics step.
-        read: entries of the state that are read, the first so many: 3 or 5.
+        action_noise: standard deviation of the noise of an action in each physics step.
+        read: number of first entries of the state that are read: 3 or 5.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class NoisyCartpole(LinearGaussianEnv):
         action_noise: float = ACTION_NOISE,
         read: int = 3,
     ):
-        # Readings, masks and the time limit are a linear system's; motion and reward are not.
+        # Readings, masks and the time limit are those of a linear system; motion and reward are defined here.
         one = torch.eye(5)
         super().__init__(
             one,
@@ -86,11 +86,11 @@ class NoisyCartpole(LinearGaussianEnv):
         return self._emit(state, tensordict["step"] + 1).set("reward", reward)
 
     def moved(self, state: Tensor, motor: Tensor) -> tuple[Tensor, np.ndarray]:
-        """States ``[N, 5]`` one action on, and MuJoCo's own ``[N, physics steps, 5]`` on the way.
+        """Returns states ``[N, 5]`` after an action, and MuJoCo's states ``[N, physics steps, 5]`` in between.
 
         Args:
             state: ``[N, 5]``.
-            motor: in each physics step, ``[N, physics steps]``, within [-1, 1].
+            motor: inputs of the motor in each physics step, ``[N, physics steps]``, within [-1, 1].
         """
         position, cos, sin, velocity, turn = state.split(1, -1)
         angle = torch.atan2(sin, cos)
@@ -101,7 +101,7 @@ class NoisyCartpole(LinearGaussianEnv):
 
 
 def swing_up(position: np.ndarray, cos: np.ndarray, turn: np.ndarray, motor: np.ndarray) -> np.ndarray:
-    """The reward of ``dm_control.suite.cartpole.Balance``, which is not sparse, of many carts."""
+    """Returns the dense reward of ``dm_control.suite.cartpole.Balance`` for a batch."""
     centered = (1 + tolerance(position, margin=2)) / 2
     small_control = (4 + tolerance(motor, margin=1, value_at_margin=0, sigmoid="quadratic")) / 5
     small_velocity = (1 + tolerance(turn, margin=5)) / 2
@@ -109,13 +109,14 @@ def swing_up(position: np.ndarray, cos: np.ndarray, turn: np.ndarray, motor: np.
 
 
 class Push(m.SubModel):
-    """The filter's motion: a network says how the velocities change, the velocities move cart and pole.
+    """The filter's motion: a network predicts the change of the velocities, which move cart and pole.
 
-    The network gives the change of both velocities without a motor, what the motor adds to the cart's, and how much of
-    a push on the cart the pole gets. The track ends where it ends: there the cart stops, which is such a push, too.
+    The network outputs the change of both velocities without a motor, the gain from the motor to the cart's velocity,
+    and the ratio of the pole's velocity change to the cart's. At the end of the track the cart stops, which changes the
+    pole's velocity by that ratio, too.
     """
 
-    MOST = 20.0  # m/s, rad/s: more is not believed
+    MOST = 20.0  # m/s, rad/s: upper bound of the speeds
 
     def __init__(self):
         network = nn.Sequential(nn.Linear(5, 32), nn.Tanh(), nn.Linear(32, 4))
@@ -123,14 +124,14 @@ class Push(m.SubModel):
         self.register_buffer("scale", torch.tensor(SCALE))
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
+        """Returns states ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
         position, cos, sin, velocity, turn = ensemble.split(1, -1)
         angle = torch.atan2(sin, cos)
         features = torch.cat([position, angle.cos(), angle.sin(), velocity, turn], -1) / self.scale
         drift, spin, motor, share = self.module(features).split(1, -1)
         push = motor * action.unsqueeze(-2)
         faster = velocity + drift + push
-        # Velocities change evenly during a step: position and angle move with their means.
+        # Constant acceleration during a step: position and angle move with the mean velocities.
         ahead = position + DT * (velocity + faster) / 2
         stop = torch.where((ahead.abs() > TRACK) & (ahead * faster > 0), -faster, 0.0)
         faster, turning = faster + stop, turn + spin + share * (push + stop)
@@ -140,14 +141,14 @@ class Push(m.SubModel):
 
 
 class Physics(m.Transition):
-    """The world's own motion, with the motor's own noise: what no filter can learn better."""
+    """The simulator's motion with the motor's true noise, an upper bound for learned motions."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
         self.world = NoisyCartpole(1, 0.0)
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
+        """Returns states ``[*B, E, 5]`` one step on, with actions ``[*B, 1]``."""
         normal = exact_draws(torch.randn(*ensemble.shape[:-1], REPEAT), ensemble)
         motor = action.unsqueeze(-2) + ACTION_NOISE * normal
         state, _ = self.world.moved(ensemble.flatten(0, -2), motor.clamp(-1, 1).flatten(0, -2))
@@ -155,12 +156,12 @@ class Physics(m.Transition):
 
 
 def exact_filter(noise: float, members: int = 32, read: int = 3) -> DEnKF:
-    """A filter that knows the world, and the noise of its readings."""
+    """Returns a filter with the simulator's motion and the true noise of the readings."""
     return _filter(Physics(), m.ConstantNoise([noise] * read, in_key="observation"), members)
 
 
 def unlearned_filter(members: int, read: int = 3) -> DEnKF:
-    """A filter that knows what is read and where an episode starts; accelerations and both noises are learned."""
+    """Returns a filter with known observation model and reset; learned acceleration and noises."""
     q = m.ConstantNoise([0.2, 0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     r = m.ConstantNoise([0.2] * read, trainable=True, in_key="observation")
     return _filter(m.NoisyTransition(Push(), q, dims=[3, 4], before=True), r, members)

@@ -1,4 +1,4 @@
-"""The mountain hike: a walker who sees the position badly has to stay on a ridge. Linear and Gaussian."""
+"""The mountain hike: a walker with noisy readings of the position has to stay on a ridge. Linear and Gaussian."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RIDGES = (((-0.4, -0.8), (0.16, 0.01)), ((0.0, 0.0), (0.01, 0.64)), ((0.4, 0.8),
 
 
 def altitude(position: Tensor) -> Tensor:
-    """Tells how high the ground is at ``[*, 2]``: three ridges make a path from the lower left to the upper right."""
+    """Returns the altitude at ``[*, 2]``: three ridges make a path from the lower left to the upper right."""
     ridges = []
     for center, spread in RIDGES:
         mean, variance = position.new_tensor(center), position.new_tensor(spread)
@@ -26,12 +26,12 @@ def altitude(position: Tensor) -> Tensor:
 
 
 class MountainHike(LinearGaussianEnv):
-    """Many walkers at once. The state is the position on the map less the start, ``[*B, 2]``; the action is a stride.
+    """A batch of walkers. The state is the position on the map minus the start, ``[*B, 2]``; the action is a stride.
 
     Args:
         count: walkers.
         noise: standard deviation of the reading, in units of the map.
-        missing: share of the readings that do not come.
+        missing: share of missing readings.
         seed: of the environment's own generator.
     """
 
@@ -57,7 +57,7 @@ class MountainHike(LinearGaussianEnv):
 
 
 def exact_filter(noise: float) -> KalmanFilter:
-    """The Kalman filter that knows the hike."""
+    """Returns the Kalman filter with the true model of the hike."""
     one = torch.eye(2)
     return KalmanFilter(
         one,
@@ -72,7 +72,7 @@ def exact_filter(noise: float) -> KalmanFilter:
 
 
 def unlearned_filter(members: int) -> DEnKF:
-    """A filter that knows what is read and where the hike starts; what an action does and both noises are learned."""
+    """Returns a filter with known observation model and reset; the effect of actions and both noises are learned."""
     linear = nn.Linear(4, 2)
     nn.init.zeros_(linear.weight)
     nn.init.zeros_(linear.bias)

@@ -1,4 +1,4 @@
-"""PPO with a filter in the policy: the noise of the collection kept with the data, or drawn again in each update.
+"""Compares PPO with a filter in the policy whose noise is kept with the data, or drawn again in each update.
 
 ``python -m benchmarks.control.kept --seeds 2``. It runs the program of docs/how_to/policies.md. The filter has few
 members and random draws, which matter: with exact ones and a linear motion its mean hardly depends on them.
@@ -37,11 +37,11 @@ class Kept:
     seeds: int = 2
     rounds: int = 25
     members: int = 8
-    page: Path | None = None  # where to leave the table
+    page: Path | None = None  # file for the table
 
 
 def make_filter(motion: nn.Module, members: int, keep: bool) -> DEnKF:
-    """The page's filter with random draws: it knows the spring, and nothing of the motor."""
+    """Returns the page's filter with random draws; the spring is known, the motor is learned."""
     q = ConstantNoise([0.0, 0.1], in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         NoisyTransition(LearnedTransition(motion, residual=False, action_key="action"), q, draws="random"),
@@ -55,7 +55,7 @@ def make_filter(motion: nn.Module, members: int, keep: bool) -> DEnKF:
 
 
 def run(study: Kept, keep: bool, seed: int) -> list[str]:
-    """Cells: share of the ratios that are clipped, return, seconds."""
+    """Returns cells: share of the ratios that are clipped, return, seconds."""
     begun, clipped, names = time.process_time(), [], {}
     set_up, ppo = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)[:2]
     exec(re.sub(r"^ROUNDS, SEED = .*$", f"ROUNDS, SEED = {study.rounds}, {seed}", set_up, flags=re.MULTILINE), names)

@@ -1,8 +1,9 @@
-"""Robots whose actions run late: a policy on the belief ahead, on the belief of now, on readings; and an LSTM.
+"""Compares policy inputs under action latency: predicted belief, current belief, raw readings; and an LSTM policy.
 
-``python -m benchmarks.control.latency``. A pendulum and an arm of two links. The policy is one of the true state
-without delay, by value iteration for the pendulum, a regulator for the arm: nothing is learned, what it sees alone
-differs. The filter knows the robot. The LSTM is trained by PPO for each delay, and sees the actions under way.
+``python -m benchmarks.control.latency``. The robots are a pendulum and an arm of two links. One fixed policy per robot
+is optimal for the true state without delay: value iteration for the pendulum, a linear regulator for the arm. Only its
+input changes. The filter has the true motion model. The LSTM is trained by PPO for each delay; its input includes the
+actions that were sent and not yet executed.
 """
 
 from __future__ import annotations
@@ -38,27 +39,27 @@ SHOWN = ("belief ahead", "belief", "last two readings", "truth")
 
 @dataclass(frozen=True)
 class Latency:
-    """Options of the study of late actions."""
+    """Options of the latency study."""
 
     robots: tuple[str, ...] = ("pendulum", "arm")
     delays: tuple[int, ...] = (2, 4, 8)  # steps of 50 ms, of sensing and inference together
     noises: tuple[float, ...] = (0.02, 0.1)  # of a reading
     members: int = 32
     seeds: int = 1
-    episodes: int = 100  # a seed
-    grid: int = 61  # angles, and speeds
+    episodes: int = 100  # per seed
+    grid: int = 61  # points along the angle, and along the speed
     env_steps: int = 100_000  # of an LSTM's training, with the first noise; 0 for none
-    page: Path | None = None  # where to leave the table
+    page: Path | None = None  # file for the table
 
 
 def moved(angle: Tensor, speed: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
-    """One step of the pendulum, 0 rad upright."""
+    """Returns one step of the pendulum, 0 rad upright."""
     speed = (speed + DT * (15 * angle.sin() + 3 * torque)).clamp(-SPEED, SPEED)
     return angle + DT * speed, speed
 
 
 def read_grid(table: Tensor, angle: Tensor, speed: Tensor) -> Tensor:
-    """Values between the points of a table ``[N, N]`` of angles, all around, and speeds."""
+    """Interpolates a table ``[N, N]`` over angles, which are periodic, and speeds."""
     count = len(table)
     x = (angle / (2 * torch.pi)).remainder(1.0) * count
     y = (speed.clamp(-SPEED, SPEED) / SPEED + 1) / 2 * (count - 1)
@@ -70,7 +71,7 @@ def read_grid(table: Tensor, angle: Tensor, speed: Tensor) -> Tensor:
 
 
 def best_policy(count: int, sweeps: int = 400, gamma: float = 0.99) -> Callable[[Tensor], Tensor]:
-    """The torque ``[*B, 1]`` that value iteration finds for states ``[*B, 3]``: one step ahead of its values."""
+    """Returns the torque ``[*B, 1]`` of value iteration for states ``[*B, 3]``, by one step of lookahead."""
     angles, speeds = torch.arange(count) / count * 2 * torch.pi, torch.linspace(-SPEED, SPEED, count)
     torques = torch.linspace(-TORQUE, TORQUE, 17)
 
@@ -91,7 +92,7 @@ def best_policy(count: int, sweeps: int = 400, gamma: float = 0.99) -> Callable[
 
 
 class TwoLinks(LinearGaussianEnv):
-    """Two links on a table that two motors hold at zero, in steps of 50 ms; pushes shake it.
+    """A horizontal arm of two links and two motors, in steps of 50 ms, with random pushes; the goal is zero angles.
 
     The state is two angles (rad) and their speeds (rad/s). The angles are read.
     """
@@ -108,7 +109,7 @@ class TwoLinks(LinearGaussianEnv):
 
     @classmethod
     def moved(cls, state: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, 4]`` a step on, without a push."""
+        """Returns states ``[*B, 4]`` after one step, without a push."""
         one, two, first, second = state.unbind(-1)
         torque = action.clamp(-1, 1) * torch.tensor(cls.GEAR)
         heavy = cls.M * cls.L**2 / 12 + cls.M * cls.C**2  # of a link around its joint
@@ -134,31 +135,31 @@ class TwoLinks(LinearGaussianEnv):
 
 
 def regulator(state: Tensor) -> Tensor:
-    """Torques ``[*B, 2]`` for the arm's true state."""
+    """Returns the torques ``[*B, 2]`` for the arm's true state."""
     return (-2.0 * state[..., :2] - 0.3 * state[..., 2:]).clamp(-1, 1)
 
 
 class Robot(NamedTuple):
-    """A simulated robot, what its filter knows, and how it is controlled."""
+    """A simulated robot, with the models of its filter and its policy."""
 
-    world: Callable[..., LinearGaussianEnv]  # many at once, of a noise, batch size and seed
-    motion: Callable[[Tensor], Tensor]  # states and actions to the next states
+    world: Callable[..., LinearGaussianEnv]  # makes a batch from noise, batch size and seed
+    motion: Callable[[Tensor], Tensor]  # maps states and actions to the next states
     start: tuple[list[float], list[float]]  # mean and standard deviations of the first state
-    shake: list[float]  # standard deviations of the motion
-    policy: Callable[[Tensor], Tensor]  # of the true state
-    angles: Callable[[Tensor], Tensor]  # of readings
-    state: Callable[[Tensor, Tensor], Tensor]  # of angles and speeds
+    shake: list[float]  # standard deviations of the process noise
+    policy: Callable[[Tensor], Tensor]  # maps the true state to actions
+    angles: Callable[[Tensor], Tensor]  # maps readings to angles
+    state: Callable[[Tensor, Tensor], Tensor]  # joins angles and speeds to a state
 
 
 def swing(x: Tensor) -> Tensor:
-    """The pendulum's own motion, on cosine, sine, speed and torque."""
+    """Returns the pendulum's next states from cosine, sine, speed and torque."""
     angle, speed = moved(torch.atan2(x[..., 1:2], x[..., :1]), x[..., 2:3], x[..., 3:])
     return torch.cat([angle.cos(), angle.sin(), speed], -1)
 
 
 @cache
 def robot(name: str, grid: int) -> Robot:
-    """The pendulum or the arm."""
+    """Returns the pendulum or the arm."""
     if name == "arm":
         motion = lambda x: TwoLinks.moved(x[..., :4], x[..., 4:])  # noqa: E731
         start = [0.0] * 4, [1.0, 1.0, 0.01, 0.01]
@@ -176,7 +177,7 @@ def robot(name: str, grid: int) -> Robot:
 
 
 def known_filter(of: Robot, noise: float, members: int) -> DEnKF:
-    """The robot's own motion."""
+    """Returns a filter with the robot's true motion."""
     return DEnKF(
         LearnedTransition(of.motion, residual=False, action_key="action"),
         None,
@@ -190,13 +191,13 @@ def known_filter(of: Robot, noise: float, members: int) -> DEnKF:
 
 
 def late_env(of: Robot, noise: float, delay: int, count: int, seed: int) -> TransformedEnv:
-    """Robots whose actions run so many steps late."""
+    """Returns an environment of robots whose actions run ``delay`` steps late."""
     env = TransformedEnv(of.world(noise, batch_size=(count,), seed=seed), InitTracker())
     return env.append_transform(LateActions(delay)) if delay else env
 
 
 def returned(study: Latency, of: Robot, noise: float, shown: str, delay: int, seed: int) -> float:
-    """The mean return of the policy that sees something; ``"nothing"`` is the robot without a motor."""
+    """Returns the mean return of the policy on the input ``shown``; ``"nothing"`` is the robot without a motor."""
     torch.manual_seed(seed)
     env = late_env(of, noise, delay, study.episodes, seed)
     if shown in ("belief", "belief ahead"):
@@ -223,7 +224,7 @@ def returned(study: Latency, of: Robot, noise: float, shown: str, delay: int, se
 
 
 def trained(study: Latency, of: Robot, noise: float, delay: int, seed: int) -> float:
-    """The mean return of an LSTM that learned with this delay."""
+    """Returns the mean return of an LSTM trained with this delay."""
     torch.manual_seed(seed)
     task, arm = TASKS["pendulum"], ARMS["LSTM"]
 
@@ -250,10 +251,11 @@ def main() -> None:
     """Writes the table."""
     study = parse(Latency)
     lines = [
-        f"{study.seeds * study.episodes} episodes. In brackets: the share of what the belief gains over no motor "
-        f"without delay. An LSTM has {study.env_steps:,} steps of PPO for each delay, one seed.",
+        f"Mean return over {study.seeds * study.episodes} episodes, by the policy's input. The percentages put no "
+        "motor at 0 and the policy on the belief without delay at 100. An LSTM is trained by PPO for each delay, on "
+        f"{study.env_steps:,} steps and one seed.",
         "",
-        *head("robot", "noise", "delay, ms", *SHOWN, "LSTM"),
+        *head("robot", "sensor noise", "delay (ms)", *SHOWN, "LSTM"),
     ]
     for name in study.robots:
         of = robot(name, study.grid)

@@ -1,4 +1,4 @@
-"""A filter that learns from what a policy collects: from readings and actions alone, or with the simulator's states."""
+"""Trains a filter on a policy's data: from readings and actions alone, or with the simulator's states."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from torch_denkf.modules import ConstantNoise, GaussianPrior
 from torch_denkf.objectives import DEnKFLoss
 
 PARTS = ("transition", "observation", "noise", "analysis")
-LEAST = 0.01  # of the noises, in the readings' and the states' units: without any, an ensemble collapses
+LEAST = 0.01  # floor of the noises, in the readings' and the states' units: without noise an ensemble collapses
 
 
 @dataclass(frozen=True)
 class Learning:
-    """Of a filter.
+    """Settings of a filter's training.
 
     Attributes:
-        window: steps of a window that is learned from; ``None`` for whole episodes, which begin as the filter's own do.
+        window: steps of a training window; ``None`` for whole episodes, which begin with the filter's initial belief.
         windows: in an update.
-        first: updates before the policy moves, on one batch of random actions.
+        first: updates before the policy acts, on one batch of random actions.
         further: updates after each of the policy's batches.
         noise_lr: learning rate of the noises' logarithms; that of the rest is 1e-2.
-        pieces: windows that an episode is cut into, if more than one; otherwise windows begin anywhere in it.
-            With ``window=None`` one.
-        within: pieces in which the first entry of a reading is larger are left out.
-        guess: whether the readings' noise begins at the value that :func:`between` finds in the first episodes, and not
-            at the filter's own.
+        pieces: number of windows that an episode is cut into; with 1, windows begin anywhere in it. Must be 1 with
+            ``window=None``.
+        within: pieces in which the first entry of a reading is larger are dropped.
+        guess: whether the readings' noise begins at the estimate of :func:`between` from the first episodes, instead
+            of the filter's value.
 
     Raises:
-        ValueError: on pieces of whole episodes.
+        ValueError: if ``window`` is ``None`` and ``pieces`` is not 1.
     """
 
     window: int | None = 16
@@ -56,13 +56,13 @@ class Learning:
 class Learner:
     """Trains a filter on random windows of a replay buffer of episodes.
 
-    A window that begins anywhere in an episode, where little is known, has a filter of the same parts with a wide
-    prior. A whole episode has the filter's own start.
+    Windows that begin anywhere in an episode are filtered with the same parts and a wide prior, whole episodes with the
+    filter's initial belief.
 
     Args:
         filter: trained in place.
         prior: mean and standard deviations of a state anywhere in an episode, ``[S]``.
-        episodes: that will come.
+        episodes: number of episodes to come.
         settings: the task's.
         taught: whether the true states are scored (fair CRPS), and not the likelihood of the readings.
     """
@@ -91,7 +91,7 @@ class Learner:
         self.episodes = ReplayBuffer(storage=storage, batch_size=settings.windows)
 
     def add(self, data: TensorDict) -> None:
-        """Keeps episodes ``[B, T]``."""
+        """Stores episodes ``[B, T]``."""
         data = data.select("observation", "observed", "action", "state")
         if self.settings.guess and not len(self.episodes):
             own, found = self.filter["noise"].log_variance, between(data["observation"]).log()
@@ -99,12 +99,12 @@ class Learner:
                 own.copy_(torch.where(found.isnan(), own, found))  # NaN where no two neighbouring readings came
         if self.settings.pieces > 1:
             data = data[:, : self.settings.pieces * self.length].reshape(-1, self.length)
-            data = data[~(data["observation"][..., 0].abs() > self.settings.within).any(-1)]  # NaN where none came
-        if len(data):  # of a batch, all pieces may be left out
+            data = data[~(data["observation"][..., 0].abs() > self.settings.within).any(-1)]  # missing readings are NaN
+        if len(data):  # all pieces of a batch may have been dropped
             self.episodes.extend(data)
 
     def update(self, updates: int) -> float:
-        """Makes some updates; the last one's loss. Without episodes none."""
+        """Runs some updates, none without episodes; returns the last one's loss."""
         value = torch.zeros(())
         for _ in range(updates if len(self.episodes) else 0):
             episodes = self.episodes.sample()
@@ -123,15 +123,15 @@ class Learner:
 
 
 def between(readings: Tensor) -> Tensor:
-    """The readings' noise as a variance ``[O]``: half of the mean square difference of neighbours in ``[B, T, O]``.
+    """Returns the readings' variance ``[O]``: half the mean square difference of neighbours in ``[B, T, O]``.
 
-    The true value's own mean square step adds half of itself. NaN where no two neighbouring readings came.
+    It includes half the mean square step of the true value. NaN if no two neighbouring readings came.
     """
     return (readings.diff(dim=1).square().nanmean((0, 1)) / 2).clamp_min(LEAST**2)
 
 
 def refiltered(filter: Filter, data: TensorDict) -> TensorDict:
-    """Whole episodes ``[B, T]`` with what a filter believes of them: means and variances."""
+    """Filters whole episodes ``[B, T]`` again, and returns them with means and variances of the new belief."""
     after = data["next"][:, -1:]
     frames = {key: torch.cat([data[key], after[key]], 1) for key in ("observation", "observed")}
     frames["action"] = torch.cat([data["action"], torch.zeros_like(data["action"][:, :1])], 1)

@@ -1,4 +1,4 @@
-"""Tables and picture of the study: interquartile means over seeds, with bootstrap intervals."""
+"""Tables and plot of the study: interquartile means over seeds, with bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ TITLES = {
     "cartpole": "Cartpole swing-up without velocities",
     "cartpole-full": "Cartpole swing-up, velocities read too",
 }
-KNOWING = ("truth", "Kalman", "physics")  # what these arms know, no filter learns
+KNOWING = ("truth", "Kalman", "physics")  # arms with the true state or the true model
 
 
 def interquartile_mean(values, axis: int = -1):
-    """The mean of the middle half."""
+    """Returns the mean of the middle half."""
     return trim_mean(values, 0.25, axis=axis)
 
 
 def summary(values: pd.Series) -> str:
-    """The interquartile mean over seeds, and the bounds of its 95 % bootstrap interval; empty where none ran."""
+    """Returns the interquartile mean over seeds and its 95 % bootstrap interval; empty for cells that did not run."""
     values = values.dropna()
     if values.empty:
         return ""
@@ -40,14 +40,14 @@ def summary(values: pd.Series) -> str:
 
 
 def is_trained(frame: pd.DataFrame) -> pd.Series:
-    """Marks rows of cells that were trained in."""
+    """Marks rows of cells in which policies were trained."""
     return ~frame.index.get_level_values("cell").str.contains(NOT_TRAINED)
 
 
 def ends(rows: pd.DataFrame) -> pd.DataFrame:
-    """The final returns of a task by cell and seed, with a column for each arm.
+    """Returns the final returns of a task by cell and seed, with a column for each arm.
 
-    What reads the truth ran in one cell alone, and returns the same in all that were trained in.
+    The arm that reads the truth ran in one cell alone; its return is copied to all cells with training.
     """
     final = rows.loc[rows.groupby(["cell", "arm", "seed"])["env_steps"].idxmax()]
     wide = final.pivot(index=["cell", "seed"], columns="arm", values="return")
@@ -60,19 +60,19 @@ def ends(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_cell(wide: pd.DataFrame) -> list[str]:
-    """A table of interquartile means over seeds, of each cell and arm."""
+    """Returns a table of interquartile means over seeds, of each cell and arm."""
     return markdown(wide.groupby("cell").agg(summary))
 
 
 def lost(wide: pd.DataFrame) -> pd.DataFrame:
-    """Percent of the return in the first cell that is lost in others, with the same seeds."""
+    """Returns the loss in other cells, in percent of the return in the first cell with the same seed."""
     home = wide.index.get_level_values("cell")[0]
     shares = 100 * (1 - wide.div(wide.loc[home], level="seed"))
     return shares.drop(home, level="cell")
 
 
 def reached(rows: pd.DataFrame) -> pd.DataFrame:
-    """Thousands of environment steps after which the interquartile mean first is the LSTM's final one."""
+    """Returns the first environment steps, in thousands, whose interquartile mean reaches the LSTM's final one."""
     means = rows.groupby(["cell", "arm", "env_steps"])["return"].agg(interquartile_mean).unstack("arm")
     goal = means["LSTM"].groupby("cell").last()
 
@@ -85,7 +85,7 @@ def reached(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def page(rows: pd.DataFrame, budget: Budget) -> str:
-    """The tables; ``budget`` is the runs'."""
+    """Returns the tables of runs with a budget."""
     lines = ["# Policies that read a belief, against policies that remember", ""]
     for task in [task for task in TITLES if task in set(rows["task"])]:
         own = rows[rows["task"] == task]
@@ -122,7 +122,7 @@ def page(rows: pd.DataFrame, budget: Budget) -> str:
 
 
 def draw(rows: pd.DataFrame, file: Path) -> None:
-    """Return against the noise of the readings, where all come: of arms that ran with each noise, if there are two."""
+    """Draws return against noise in cells without missing readings, for tasks with two noises or more."""
     whole = rows[~rows["cell"].str.contains(f"missing|{NOT_TRAINED}")]
     tasks = [task for task in TITLES if whole.loc[whole["task"] == task, "cell"].nunique() > 1]
     if not tasks:

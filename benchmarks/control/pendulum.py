@@ -1,4 +1,4 @@
-"""The filter of the pendulum: what a velocity does to the angle is known, what changes the velocity is learned."""
+"""The filter of the pendulum, with known kinematics and a learned acceleration."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ STEPS = 200  # of an episode
 
 
 def world(count: int, noise: float, missing: float, seed: int) -> NoisyPendulumEnv:
-    """Many pendulums."""
+    """Returns a batch of pendulums."""
     return NoisyPendulumEnv(noise, missing=missing, max_steps=STEPS, batch_size=[count], seed=seed)
 
 
 class Swing(m.Transition):
-    """The filter's motion: a network says how the velocity changes, the velocity turns the angle."""
+    """The filter's motion: a network predicts the change of the velocity, which turns the angle."""
 
     def __init__(self):
         network = nn.Sequential(nn.Linear(4, 32), nn.Tanh(), nn.Linear(32, 1))
         super().__init__(network, [("belief", "ensemble"), "action"], [("forecast", "ensemble")])
 
     def compute(self, ensemble: Tensor, action: Tensor) -> Tensor:
-        """States ``[*B, E, 3]`` (cosine, sine, rad/s) one step on, with torques ``[*B, 1]``."""
+        """Returns states ``[*B, E, 3]`` (cosine, sine, rad/s) one step on, with torques ``[*B, 1]``."""
         cos, sin, velocity = ensemble.split(1, -1)
         angle = torch.atan2(sin, cos)
         torque = (action / NoisyPendulumEnv.MAX_TORQUE).unsqueeze(-2).expand_as(velocity)
@@ -37,7 +37,7 @@ class Swing(m.Transition):
 
 
 def unlearned_filter(members: int) -> DEnKF:
-    """A filter that knows what is read; acceleration and both noises are learned."""
+    """Returns a filter with a known measurement model; acceleration and both noises are learned."""
     q = m.ConstantNoise([0.3], trainable=True, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return DEnKF(
         transition=m.NoisyTransition(Swing(), q, dims=[2], before=True),

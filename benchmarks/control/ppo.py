@@ -25,20 +25,20 @@ WIDTH = 64
 
 @dataclass(frozen=True)
 class Settings:
-    """Of PPO."""
+    """Settings of PPO."""
 
     gamma: float
     lmbda: float
     epochs: int = 10
     minibatch: int = 320  # steps
-    slice: int = 40  # steps that a recurrent network is trained through; others see steps in any order
+    slice: int = 40  # steps of a recurrent network's training slices; other networks see steps in any order
     lr: float = 1e-3
     clip: float = 0.2
     reward: float = 1.0  # factor
 
 
 class Head(nn.Module):
-    """Two hidden layers on an entry in units of ``scale``."""
+    """Network with two hidden layers on an entry in units of ``scale``."""
 
     def __init__(self, width: int, outputs: int, scale: Tensor | None = None):
         super().__init__()
@@ -47,12 +47,12 @@ class Head(nn.Module):
         self.register_buffer("scale", torch.ones(1) if scale is None else scale)
 
     def forward(self, value: Tensor) -> Tensor:
-        """Outputs ``[*B, outputs]``."""
+        """Returns outputs ``[*B, outputs]``."""
         return self.layers(value / self.scale)
 
 
 class ActorHead(Head):
-    """Mean and standard deviation of an action; the latter is the same everywhere."""
+    """Mean and standard deviation of an action; the latter does not depend on the state."""
 
     def __init__(self, width: int, outputs: int, scale: Tensor | None = None):
         super().__init__(width, outputs, scale)
@@ -62,17 +62,17 @@ class ActorHead(Head):
             self.layers[-1].bias.zero_()
 
     def forward(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Two times ``[*B, A]``."""
+        """Returns mean and standard deviation, ``[*B, A]`` each."""
         mean = super().forward(value)
         return mean, self.log_std.exp().expand_as(mean)
 
 
 def networks(arm: Arm, inputs: Inputs) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
-    """Actor, which writes ``"raw"``, and critic.
+    """Returns an actor, which writes ``"raw"``, and a critic.
 
     Args:
-        arm: whose they are.
-        inputs: sizes and units of what it reads.
+        arm: of the networks.
+        inputs: sizes and units of their inputs and outputs.
     """
     parts = []
     for name, Module, outputs in (("actor", ActorHead, inputs.actions), ("critic", Head, 1)):
@@ -95,17 +95,17 @@ class PPO:
     """Learns from batches of whole episodes ``[B, T]``.
 
     Args:
-        arm: who learns. With a memory, actor and critic are trained on slices of time.
-        inputs: sizes and units of what it reads.
+        arm: of the policy. With a memory, actor and critic are trained on slices of time.
+        inputs: sizes and units of the networks' inputs and outputs.
         settings: the task's.
-        batches: that will come; the learning rate goes down to 5 % meanwhile.
-        filter: of the environment, which the actor's loss trains, too: it filters slices of time once more, each from
-            the ensemble that was stored there. The critic reads what was believed when the data came.
+        batches: number of batches, over which the learning rate decreases to 5 %.
+        filter: of the environment, if the actor's loss trains it, too: it filters slices of time again, each from the
+            stored ensemble. The critic reads the belief at collection.
 
     Attributes:
         actor: writes ``"raw"``.
         critic: writes ``"state_value"``.
-        policy: writes ``"action"``, and what the critic keeps in mind.
+        policy: writes ``"action"``, and the memory of the critic.
     """
 
     ON_POLICY = True  # random actions are not learned from
@@ -137,7 +137,7 @@ class PPO:
         self.schedule = torch.optim.lr_scheduler.LinearLR(self.optimiser, 1.0, 0.05, batches)
 
     def update(self, data: TensorDict) -> None:
-        """One batch."""
+        """Learns from one batch."""
         s = self.settings
         data = data.exclude("next", "state_value", "actor_memory", "critic_memory").set("next", data["next"].copy())
         data["next", "reward"] = s.reward * data["next", "reward"]

@@ -1,4 +1,4 @@
-"""One run: an arm learns a task for a number of environment steps, and is tested meanwhile."""
+"""One run: trains an arm on a task for a number of environment steps, with tests in between."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LEFT = f"{SHIFTED}, R as learned"
 
 @contextmanager
 def told(filter: Filter | None, noise: float) -> Iterator[None]:
-    """Sets R of a filter, which nothing else is told, to the square of ``noise`` for a while."""
+    """Sets R of a filter to the square of ``noise`` within a context; nothing else changes."""
     if filter is None:
         yield
         return
@@ -45,15 +45,15 @@ def told(filter: Filter | None, noise: float) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Budget:
-    """Holds what all arms of all tasks may use.
+    """Budget of a run, the same for all arms of all tasks.
 
     Attributes:
-        env_steps: in the place of the task's; ``None`` for those.
+        env_steps: environment steps; ``None`` for the task's.
         tests: in a run, evenly spaced.
         episodes: of a test.
         members: of an ensemble.
         updates: of a filter, as a share of the task's.
-        every: environment steps for each update of SAC, in the place of the task's; ``None`` for those.
+        every: environment steps for each update of SAC; ``None`` for the task's.
     """
 
     env_steps: int | None = None
@@ -65,15 +65,15 @@ class Budget:
 
 
 def batches_of(task: Task, budget: Budget) -> tuple[int, list[int]]:
-    """Tells how many batches of episodes a run has, and after which of them it is tested."""
+    """Returns the number of batches of episodes in a run, and the batches that are followed by a test."""
     batches = max(1, (budget.env_steps or task.env_steps) // (task.count * task.steps))
     return batches, [number for number in range(1, batches + 1) if number * budget.tests % batches < budget.tests]
 
 
 def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
-    """Names of the tests in which the readings are noisier than in the training: with the filter told, and with not.
+    """Returns the names of the tests with more noise than in training, with the new R and with the learned R.
 
-    None of a cell after whose training the readings stay as they are.
+    Cells whose noise does not change after training have none.
     """
     if task.shift is None or cell[0] != task.shift_from:
         return []
@@ -81,20 +81,20 @@ def shifted_names(task: Task, cell: tuple[float, float]) -> list[str]:
 
 
 def rollout(env: EnvBase, policy: TensorDictModuleBase | None, steps: int, kind: ExplorationType) -> TensorDict:
-    """Whole episodes ``[B, T]``."""
+    """Returns whole episodes ``[B, T]``."""
     with torch.no_grad(), set_exploration_type(kind):
         return env.rollout(steps, policy, break_when_any_done=False)
 
 
 def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: int, filter: Filter | None) -> EnvBase:
-    """The world with what the arm reads.
+    """Returns the environment with the inputs of the arm.
 
     Args:
-        task: the world's.
-        arm: the reader.
-        count: worlds.
+        task: of the environment.
+        arm: that reads it.
+        count: batch size.
         cell: noise of the readings, and missing share.
-        seed: of the world.
+        seed: of the environment.
         filter: the arm's, if any.
     """
     env = TransformedEnv(task.world(count, *cell, seed), InitTracker())
@@ -108,7 +108,7 @@ def make_env(task: Task, arm: Arm, count: int, cell: tuple[float, float], seed: 
 
 
 def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, budget: Budget) -> list[dict]:
-    """Rows: the return after some numbers of environment steps, and the processor's seconds until then."""
+    """Returns a row for each test: the return, and the processor's seconds of training until then."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     task, arm, spent = TASKS[task_name], ARMS[arm_name], 0.0
@@ -171,6 +171,6 @@ def run(task_name: str, cell: tuple[float, float], arm_name: str, seed: int, bud
 
 
 def cell_name(cell: tuple[float, float]) -> str:
-    """Of noise and missing share."""
+    """Returns the name of a cell: noise and missing share."""
     noise, missing = cell
     return f"noise {noise:g}" + (f", {missing:.0%} missing" if missing else "")

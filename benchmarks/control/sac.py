@@ -19,20 +19,20 @@ from torch_denkf.filters import Filter
 
 @dataclass(frozen=True)
 class Settings:
-    """Of SAC."""
+    """Settings of SAC."""
 
     gamma: float = 0.99
     every: int = 5  # environment steps for each update
     batch: int = 256  # steps, in any order
     recurrent_batch: int = 500  # steps of a recurrent network, in slices
-    slice: int = 50  # steps that a recurrent network is trained through
+    slice: int = 50  # steps of a recurrent network's training slices
     units: int = 128  # of a hidden layer
     lr: float = 1e-3
-    target: float = 0.995  # that stays of the target networks in an update
+    target: float = 0.995  # share of the target networks' parameters that an update keeps
 
 
 class Scaled(nn.Module):
-    """Two hidden layers on an entry in units of ``scale``, and on the action behind it, if there is one."""
+    """Network with two hidden layers on an entry in units of ``scale``, and on the action if one is given."""
 
     def __init__(self, width: int, outputs: int, units: int, scale: Tensor | None):
         super().__init__()
@@ -40,12 +40,12 @@ class Scaled(nn.Module):
         self.register_buffer("scale", torch.ones(1) if scale is None else scale)
 
     def forward(self, value: Tensor, *action: Tensor) -> Tensor:
-        """Outputs ``[*B, outputs]``."""
+        """Returns outputs ``[*B, outputs]``."""
         return self.layers(torch.cat([value / self.scale, *action], -1))
 
 
 def networks(arm: Arm, inputs: Inputs, units: int) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
-    """Actor, which writes ``"action"``, and critic, which reads it."""
+    """Returns an actor, which writes ``"action"``, and a critic, which reads it."""
     before, key, width, scale = reader(arm, inputs, "actor")
     head = nn.Sequential(Scaled(width, 2 * inputs.actions, units, scale), NormalParamExtractor(scale_lb=1e-3))
     actor = ProbabilisticActor(
@@ -61,13 +61,13 @@ def networks(arm: Arm, inputs: Inputs, units: int) -> tuple[TensorDictModuleBase
 
 
 class SAC:
-    """Learns from all episodes ``[B, T]`` that came so far.
+    """Learns from all episodes ``[B, T]`` so far.
 
     Args:
-        arm: who learns. With a memory, actor and critics have one each, and are trained on slices of time.
-        inputs: sizes and units of what it reads.
+        arm: of the policy. With a memory, actor and critics have one each, and are trained on slices of time.
+        inputs: sizes and units of the networks' inputs and outputs.
         settings: the task's.
-        batches: that will come.
+        batches: number of batches to come.
 
     Attributes:
         actor: writes ``"action"``.
@@ -84,7 +84,7 @@ class SAC:
         self.policy = self.actor
         self.keys = ["action", ("next", "reward"), *_both("is_init", "done", "terminated"), *_both(*self.actor.in_keys)]
         if arm.filter:
-            self.keys += _both("observation", "observed")  # to filter once more
+            self.keys += _both("observation", "observed")  # to filter again
         self.loss = SACLoss(
             self.actor,
             self.critic,
@@ -98,7 +98,7 @@ class SAC:
         self.buffer: TensorDictReplayBuffer | None = None
 
     def refilter(self, filter: Filter) -> None:
-        """Puts what a filter believes in the place of what was believed when an episode was collected."""
+        """Replaces the beliefs stored at collection by those of the present filter."""
         if self.buffer is None:
             return
         data = refiltered(filter, self.buffer[:].select(*self.keys).clone().reshape(-1, self.steps))
@@ -106,7 +106,7 @@ class SAC:
         self.buffer.extend(data.reshape(-1))
 
     def update(self, data: TensorDict) -> None:
-        """Keeps a batch of episodes, and learns."""
+        """Stores a batch of episodes, and learns."""
         data = data.select(*self.keys)
         if self.buffer is None:
             self.steps, self.buffer = data.shape[1], self._empty_buffer(data)
@@ -129,5 +129,5 @@ class SAC:
 
 
 def _both(*keys: NestedKey) -> list[NestedKey]:
-    """Keys before and after a step."""
+    """Returns keys before and after a step."""
     return [*keys, *(unravel_key(("next", key)) for key in keys)]

@@ -18,7 +18,7 @@ from benchmarks.control.run import Budget, cell_name, run, shifted_names
 from benchmarks.control.tasks import TASKS
 
 SEEING = ("last reading", "four readings", "LSTM")
-CELLS = {  # noise of readings, and missing share; those that say most come first
+CELLS = {  # noise of readings, and missing share; the most informative first
     "hike": [(noise, 0.0) for noise in (0.4, 0.0, 0.8, 0.2, 0.1)],
     "pendulum": [(0.2, 0.3), (0.0, 0.0), (0.2, 0.0), (0.2, 0.6), (0.3, 0.0), (0.1, 0.0)],
     "cartpole": [(0.1, 0.0), (0.3, 0.0)],
@@ -29,28 +29,28 @@ READERS = {
     "pendulum": ("belief mean", "belief mean, taught", "belief mean, end to end", *SEEING),
     "cartpole": ("belief mean", "LSTM", "physics"),
     "cartpole-full": ("belief mean", "LSTM", "physics", "last reading"),
-}  # in the order in which they run; what reads the truth is the same in all cells, and runs in that of the least noise
+}  # in running order; the arm "truth" is added in the cell of the least noise
 FEW = ("Kalman", "physics", "belief mean", "LSTM", "last reading", "truth")  # in all cells
-MORE_CELLS = 2  # the others run in a task's first cells,
-ONCE = ("belief mean, end to end",)  # and these, which take long, in its first cell
-SEEDS = range(100)  # that the tables know
+MORE_CELLS = 2  # number of a task's first cells in which the other arms run
+ONCE = ("belief mean, end to end",)  # slow arms, which run only in the first cell
+SEEDS = range(100)  # seeds that the tables read
 
 
 @dataclass(frozen=True)
 class Study:
-    """Policies that read a belief, against policies that remember. See benchmarks/control/README.md."""
+    """Compares policies on a belief with policies with memory. See benchmarks/control/README.md."""
 
-    out: Path = Path("runs/control")  # a run that was broken off goes on from here
+    out: Path = Path("runs/control")  # an interrupted run resumes from here
     tasks: some_of(CELLS) = tuple(CELLS)
     cells: int = 6  # the first so many of each task
-    seeds: int = 5  # 0 only makes the tables of what is there
+    seeds: int = 5  # 0 only makes the tables of finished runs
     processes: int = 1
-    known: Path | None = None  # a control.csv: what has rows there is not run again
+    known: Path | None = None  # a control.csv: runs with rows there are not run again
     smoke: bool = False  # a tiny run of a cell of each task: does it run?
 
 
 def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
-    """The arms that run in a cell."""
+    """Returns the arms that run in a cell."""
     number = CELLS[task].index(cell)
     arms = (*READERS[task], "truth") if cell == min(CELLS[task]) else READERS[task]
     if number >= MORE_CELLS:
@@ -59,13 +59,13 @@ def arms_of(task: str, cell: tuple[float, float]) -> tuple[str, ...]:
 
 
 def part(study: Study, task: str, cell: tuple[float, float], arm: str, seed: int) -> Path:
-    """Tells where a run leaves its rows."""
+    """Returns the file for the rows of a run."""
     name = arm.replace(", ", "-").replace(" ", "-")
     return study.out / "parts" / task / f"{cell[0]:g}-{cell[1]:g}" / f"{name}-{seed}.json"
 
 
 def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
-    """All runs with a seed."""
+    """Yields all runs with a seed."""
     for task in study.tasks:
         for cell in CELLS[task][: study.cells]:
             for arm in arms_of(task, cell):
@@ -73,7 +73,7 @@ def jobs(study: Study, seed: int, budget: Budget) -> Iterator[partial]:
 
 
 def keep(study: Study, table: Path) -> None:
-    """Leaves the rows of a table where their runs would have left them; what has run is not overwritten."""
+    """Writes the rows of a table to the files of their runs, without overwriting finished runs."""
     rows = pd.read_csv(table)
     trained = {
         (task, name): cell
@@ -87,7 +87,7 @@ def keep(study: Study, table: Path) -> None:
 
 
 def complete(study: Study) -> list[dict]:
-    """The rows of seeds with which all arms of a cell have run; says of others what they lack."""
+    """Returns the rows of seeds with which all arms of a cell have run; prints the missing arms of others."""
     files: list[Path] = []
     for task in study.tasks:
         for cell in CELLS[task]:
@@ -102,7 +102,7 @@ def complete(study: Study) -> list[dict]:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study, budget = parse(Study), Budget()
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="control-")), seeds=1, cells=1)
@@ -117,7 +117,7 @@ def main() -> None:
     side_by_side(todo, study.processes, "runs")
     rows = complete(study)
     if not rows:
-        raise SystemExit(f"{study.out} holds no cell of which all arms have run.")
+        raise SystemExit(f"{study.out} has no cell in which all arms have run.")
     table = write_table(rows, study.out / "control.csv", ("task", "cell", "arm", "seed", "env_steps"))
     draw(table, study.out / "control.png")
     write_page(page(table, budget), study.out / "control.md")

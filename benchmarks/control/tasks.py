@@ -16,23 +16,23 @@ from torch_denkf.filters import DEnKF, Filter
 
 @dataclass(frozen=True)
 class Task:
-    """A world, what is known of it, and who learns in it.
+    """A simulated world with its filters, its agent and their settings.
 
     Attributes:
-        world: many at once, of a count, noise of readings, missing share and seed.
-        unlearned: a filter of a number of members.
-        exact: the filter that knows the world, of the readings' noise; where there is one.
+        world: makes a batch from a count, noise of readings, missing share and seed.
+        unlearned: makes a filter before training from a number of members.
+        exact: makes the filter with the true model from the readings' noise; ``None`` if there is none.
         steps: of an episode.
-        count: worlds at once.
+        count: batch size of the environment.
         limit: of an action.
-        scale: of a state, for the networks; the readings, which are its first entries, in the same units.
+        scale: of a state, for the networks; the readings, which are its first entries, have the same units.
         prior: mean and standard deviations of a state anywhere in an episode.
         settings: of PPO, or of SAC.
         learning: of the filter.
         agent: PPO or SAC.
-        env_steps: of a run, with those of random actions.
+        env_steps: of a run, including random actions.
         shift: noise of the readings in a second test, after all training with ``shift_from``; ``None`` for none.
-        shift_from: the noise that the readings have before.
+        shift_from: noise of the readings in training, for cells with a second test.
     """
 
     world: Callable[[int, float, float, int], EnvBase]
@@ -99,7 +99,7 @@ TASKS["cartpole-full"] = replace(
     exact=partial(cartpole.exact_filter, read=5),
 )
 
-RATES = {  # of PPO: factors on a task's learning rate, of .3, 1, 3 and 10 the best on three other seeds; others have 1
+RATES = {  # of PPO: factors on a task's learning rate, the best of .3, 1, 3, 10 on three other seeds; others have 1
     **dict.fromkeys([("hike", "belief mean"), ("hike", "last reading")], 0.3),
     **dict.fromkeys([("pendulum", arm) for arm in ("LSTM", "last reading", "four readings")], 3.0),
 }

@@ -25,7 +25,7 @@ TASKS = ("pick", "push", "put_down")
 
 @torch.no_grad()
 def record(demos: int, steps: int, seed: int) -> TensorDict:
-    """Demonstrations at 100 Hz, ``[demos, 8 steps]``: truth, readings, what the shipped sensor reads of pictures."""
+    """Returns demonstrations at 100 Hz, ``[demos, 8 steps]``: truth, and readings of encoders, force and camera."""
     sensor, rows = from_pretrained("ur5-table")["sensor"], []
     for number in range(demos):
         env = UR5TableEnv(TASKS[number % 3], size=(64, 64), seed=seed + number, max_steps=steps)
@@ -59,7 +59,7 @@ def record(demos: int, steps: int, seed: int) -> TensorDict:
 
 
 def finer(angles: Tensor) -> Tensor:
-    """Angles ``[N, T, 7]`` at 12.5 Hz on smooth paths at 100 Hz, ``[N, 8 T, 7]`` (cubic Hermite)."""
+    """Interpolates angles ``[N, T, 7]`` at 12.5 Hz to 100 Hz, ``[N, 8 T, 7]`` (cubic Hermite)."""
     slope = torch.gradient(angles, dim=1)[0]
     end, end_slope = (torch.cat([value[:, 1:], value[:, -1:]], 1) for value in (angles, slope))
     t = (torch.arange(EVERY) / EVERY).reshape(1, 1, EVERY, 1)
@@ -70,12 +70,12 @@ def finer(angles: Tensor) -> Tensor:
 
 
 def arm_task(*, demos: tuple[int, int] = (24, 6), steps: int = 75, validate: bool = False) -> Task:
-    """The task.
+    """Returns the task.
 
     Args:
         demos: for training, and for the test.
         steps: of the environment in each, 0.08 s.
-        validate: whether the recordings to be scored are not the test's.
+        validate: whether to score validation recordings instead of the test's.
     """
     names = ("camera", "encoders", "force")
     train, test = record(demos[0], steps, 10_000), record(demos[1], steps, 30_000 if validate else 20_000)
@@ -85,7 +85,7 @@ def arm_task(*, demos: tuple[int, int] = (24, 6), steps: int = 75, validate: boo
     train, test = (add_features(data, noises) for data in (train, test))
     move = eye.clone()
     move[:JOINTS, JOINTS:-1] = DT * torch.eye(JOINTS)
-    # How the rates walk, from what they change by in a step of the environment.
+    # The random walk of the rates, from their change over a step of the environment.
     rates = train["state"][..., JOINTS:-1]
     walk = (rates[:, EVERY:] - rates[:, :-EVERY]).square().mean((0, 1)).div(EVERY).sqrt()
     push = torch.cat([walk, torch.tensor([DRIFT * math.sqrt(DT) / STIFFNESS])])

@@ -25,20 +25,20 @@ from torch_denkf.pretrained import from_pretrained
 
 FINER = 5  # filter steps between two frames
 DT, FIX, LATE = KITTI_DT / FINER, 48, 15  # s; steps between two fixes of the GPS, and by which they are late
-CAMERA = torch.tensor([0.6, 0.02])  # m/s and rad/s of the camera's readings in training, and their gain's error
-GAIN, SLIP = 0.05, 0.02  # of the camera and of the wheels, for each drive
+CAMERA = torch.tensor([0.6, 0.02])  # m/s and rad/s, noise of the camera's readings in training
+GAIN, SLIP = 0.05, 0.02  # scale errors of the camera and of the wheels, drawn for each drive
 WHEELS, GPS = torch.tensor([0.3, 0.03]), torch.tensor([1.5, 1.5])  # m/s and rad/s; m
-MIDDLE = 2  # steps from the middle of the time between two frames, to which a reading belongs, to the second one
-START = torch.tensor([0.5, 0.5, 0.02, 1.0, 0.05])  # m, m, rad, m/s, rad/s: how well the filter knows where it starts
-TRAIN, VALIDATION = ("02", "05", "08", "09", "10"), ("03", "04", "07")  # paths without pictures
+MIDDLE = 2  # latency of a reading, which belongs to the time midway between two frames, in steps
+START = torch.tensor([0.5, 0.5, 0.02, 1.0, 0.05])  # m, m, rad, m/s, rad/s: standard deviations of the initial state
+TRAIN, VALIDATION = ("02", "05", "08", "09", "10"), ("03", "04", "07")  # paths without images
 
 
 def readings(states: Tensor, camera: Tensor, seed: int) -> TensorDict:
-    """All readings of drives at 50 Hz.
+    """Returns all readings of drives at 50 Hz.
 
     Args:
-        states: truth at 10 Hz, ``[N, T, 5]``: the velocities are those of the step that led there.
-        camera: what it reads of the velocities, ``[N, T, 2]``.
+        states: truth at 10 Hz, ``[N, T, 5]``: the velocities are those of the step before.
+        camera: its readings of the velocities, ``[N, T, 2]``.
         seed: of the simulated sensors.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -68,7 +68,7 @@ def readings(states: Tensor, camera: Tensor, seed: int) -> TensorDict:
 
 @torch.no_grad()
 def recorded(root: Path, frames: int) -> tuple[Tensor, Tensor]:
-    """Truth and the shipped sensor's readings of real drives, in windows, ``[N, frames, ...]`` each."""
+    """Returns windows of real drives ``[N, frames, ...]``: true states, and readings of the shipped sensor."""
     car, parts = from_pretrained("car-odometry"), []
     for name in list_kitti_drives(root):
         data = Drive(root, name, car.settings.size, True).read()
@@ -84,7 +84,7 @@ def recorded(root: Path, frames: int) -> tuple[Tensor, Tensor]:
 
 
 def driven(root: Path, names: Sequence[str], frames: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Windows of true paths, and what a camera might read there."""
+    """Returns windows of true paths, and simulated readings of a camera."""
     parts = []
     for name in names:
         poses = read_poses(root / "poses" / f"{name}.txt")
@@ -97,7 +97,7 @@ def driven(root: Path, names: Sequence[str], frames: int, seed: int) -> tuple[Te
 
 
 def simulated(frames: int, seed: int, count: int = 2) -> tuple[Tensor, Tensor]:
-    """Windows of a made-up drive, for a run without data."""
+    """Returns windows of a synthetic drive, for a run without data."""
     generator = torch.Generator().manual_seed(seed)
     velocity = torch.tensor([10.0, 0.0]) + torch.randn(count, frames, 2, generator=generator) * torch.tensor([1.0, 0.1])
     pose, states = torch.zeros(count, 3), []
@@ -108,12 +108,12 @@ def simulated(frames: int, seed: int, count: int = 2) -> tuple[Tensor, Tensor]:
 
 
 def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> Task:
-    """The task, on real frames, or on a made-up drive where there are no data.
+    """Returns the task, on real frames, or on a synthetic drive without data.
 
     Args:
         root: folder with ``sequences`` and ``poses``.
         frames: of each recording, 0.103 s apart.
-        validate: whether the recordings to be scored are of other paths without pictures, not of the test's drives.
+        validate: whether to score validation paths with a simulated camera instead of the test's drives.
     """
     train = readings(*(simulated(frames, 1) if root is None else driven(root, TRAIN, frames, 1)), 1)
     if root is None:
@@ -123,7 +123,7 @@ def car_task(root: Path | None, *, frames: int = 60, validate: bool = False) -> 
     test = delayed(readings(*paths, 2), "gps", LATE)
     noises = {"camera": CAMERA, "wheels": WHEELS, "gps": GPS}
     models = {"camera": Select(VELOCITIES), "wheels": Select(VELOCITIES), "gps": Select([0, 1])}
-    late = {"camera": FINER, "wheels": FINER, "gps": 0}  # beside what they are late anyway
+    late = {"camera": FINER, "wheels": FINER, "gps": 0}  # in addition to their usual latency
     longest = {"camera": MIDDLE + FINER, "wheels": FINER, "gps": LATE}
     parts = {name: ConstantNoise(noises[name], trainable=True, in_key=name) for name in models}
     walk = {"in_key": ("belief", "mean"), "out_key": ("forecast", "noise")}

@@ -30,26 +30,26 @@ WINDOW, BATCH = 200, 36  # steps of a training window, and windows in an update
 
 @dataclass(frozen=True)
 class Study:
-    """Several sensors in one filter, on a UR5 and on KITTI: every subset, and each sensor disturbed and delayed."""
+    """Fuses several sensors on a UR5 and on KITTI: every subset, and each sensor disturbed and delayed."""
 
-    kitti: Path | None = None  # folder with sequences and poses; without it the car's task is left out
+    kitti: Path | None = None  # folder with sequences and poses; without it the car's task is skipped
     out: Path = Path("runs/fusion")
     demos: tuple[int, int] = (24, 6)  # of the UR5, for training and for the test
     seeds: int = 3  # trainings
-    validate: bool = False  # score recordings that are not the test's, to choose by
+    validate: bool = False  # score validation recordings instead of the test's
     processes: int = 1
     smoke: bool = False  # tiny tasks: does it run?
 
 
 def subsets(task: Task) -> list[tuple[str, ...]]:
-    """Every set of sensors, the smallest first."""
+    """Returns every set of sensors, the smallest first."""
     names = task.sensors
     return [some for count in range(1, len(names) + 1) for some in combinations(names, count)]
 
 
 @torch.no_grad()
 def conditions(task: Task) -> tuple[dict[tuple[str, str], TensorDict], slice]:
-    """Recordings by sensors and condition, and the steps of the faults."""
+    """Returns recordings by sensors and condition, and the steps of the faults."""
     every, count = task.sensors, task.test.shape[1]
     length = min(round(SECONDS * task.rate), count // 2)
     begin = (count - length) // 2
@@ -67,7 +67,7 @@ def conditions(task: Task) -> tuple[dict[tuple[str, str], TensorDict], slice]:
 
 @torch.no_grad()
 def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
-    """Errors under all conditions, all recordings of all conditions as one batch."""
+    """Returns errors under all conditions; all recordings of all conditions run in one batch."""
     cases, span = conditions(task)
     whole, out = torch.cat(list(cases.values())), []
     for method, network in zip(METHODS, (None, weights), strict=True):
@@ -95,17 +95,17 @@ def rows(task: Task, weights: torch.nn.Module) -> list[dict]:
 
 
 def run(model, data: TensorDict) -> TensorDict:
-    """The filter's means beside the truth."""
+    """Returns the filter's means and the truth."""
     return model.sequence(data.copy(), keep=[("belief", "mean")])
 
 
 def rms(error: torch.Tensor) -> float:
-    """Root of the mean square of errors of some components, as a length where they are coordinates."""
+    """Returns the root mean square over all errors and components."""
     return float(error.square().mean().sqrt())
 
 
 def job(name: str, seed: int, study: Study) -> list[dict]:
-    """All of one task, trained with one seed."""
+    """Returns all rows of one task, trained with one seed."""
     if name == "UR5":
         sizes = {"demos": (2, 2), "steps": 3} if study.smoke else {"demos": study.demos}
         task = arm_task(**sizes, validate=study.validate)
@@ -124,7 +124,7 @@ def job(name: str, seed: int, study: Study) -> list[dict]:
 
 
 def page(found: Sequence[dict], study: Study) -> str:
-    """Tables of both tasks: medians over the seeds."""
+    """Returns the tables of both tasks: medians over the seeds."""
 
     def middle(rows: Sequence[dict], column: str = "error") -> str:
         return f"{median(row[column] for row in rows):.3g}"
@@ -138,7 +138,8 @@ def page(found: Sequence[dict], study: Study) -> str:
         subset = pick(own, condition="as it is")
         for sensors in dict.fromkeys(row["sensors"] for row in subset):
             lines.append(line(sensors, *(middle(pick(subset, sensors=sensors, method=method)) for method in METHODS)))
-        lines += ["", f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, beside the error of the"]
+        fails = f"A sensor fails for {SECONDS:g} s, unannounced; the error in that time, compared with the error of the"
+        lines += ["", fails]
         lines += ["filter that never had the sensor, in the same time.", ""]
         lines += head("fault", "plain", "weights", "never had it", "plain, times", "weights, times", "worst training")
         failing = [row for row in own if "error_ratio" in row]
@@ -155,7 +156,7 @@ def page(found: Sequence[dict], study: Study) -> str:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study = parse(Study)
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="fusion-")), seeds=1)

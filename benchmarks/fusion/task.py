@@ -1,4 +1,4 @@
-"""Describes both tasks, and what can happen to a sensor."""
+"""Describes both tasks, and the faults of a sensor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch_denkf.fusion import FusedFilter, FusedSensor
 from torch_denkf.modules import SubModel
 
-#: What a sensor does for a while, without a word.
+#: Faults of a sensor, which no mask announces.
 FAULTS = ("frozen", "offset", "noise")
 STARTUP = 0.5  # seconds, in which the first readings come
 FEATURE_STEPS = 5  # readings of which the spread is a feature
@@ -25,18 +25,18 @@ class Task:
     Attributes:
         name: of the task.
         rate: of the filter's steps, in Hz.
-        offsets: by sensor, what a fault adds, in the reading's units.
+        offsets: by sensor, bias of the fault "offset", in the reading's units.
         noises: by sensor, standard deviations of the readings.
-        failing: the sensors of which one fails in a training window; those that matter most stand there twice.
+        failing: sensors from which the faulty one of a training window is drawn; a repeated name is drawn more often.
         slope: of the weights before training, see :class:`~torch_denkf.fusion.SensorAttention`.
         updates: of the noise and of the weights.
-        late: by sensor, by how many more steps its readings come late where it is delayed.
+        late: by sensor, additional latency in steps in the tests of delays.
         train: windows ``[N, T]`` on which noise and weights are trained.
         test: recordings ``[N, T]``.
-        parts: what is trained: the modules of the noise.
-        build: makes a filter of these, from the network of its weights and whether it heeds delays.
-        heeds: whether the usual filter does.
-        loss: of a filter's output, to be trained on.
+        parts: the trainable modules of the noise.
+        build: makes a filter of these from the network of its weights, and a flag that enables its model of delays.
+        heeds: whether the usual filter models delays.
+        loss: training loss of a filter's output.
         error: of a belief against the truth, ``[N, T, D]``, in ``unit``.
         unit: of the errors.
     """
@@ -60,19 +60,19 @@ class Task:
 
     @property
     def sensors(self) -> list[str]:
-        """Names of all sensors."""
+        """Returns names of all sensors."""
         return list(self.offsets)
 
     @property
     def settled(self) -> slice:
-        """The steps that are scored: all but those of the start-up."""
+        """Returns the scored steps: all but those of the start-up."""
         return slice(round(min(STARTUP * self.rate, self.test.shape[1] // 4)), None)
 
 
 def fused_sensors(
     models: Mapping[str, SubModel], parts: Mapping[str, SubModel], delays: Mapping[str, int], weighted: bool, heed: bool
 ) -> dict[str, FusedSensor]:
-    """Returns the sensors of a filter: their models and noises, whether features weigh them, and delays are heeded."""
+    """Returns the sensors of a filter with their models and noises, and optionally with features and delays."""
     return {
         name: FusedSensor(
             model,
@@ -86,7 +86,7 @@ def fused_sensors(
 
 
 def without(data: TensorDict, *sensors: str) -> TensorDict:
-    """The recordings without some sensors' readings."""
+    """Returns the recordings without some sensors' readings."""
     out = data.copy()
     for name in sensors:
         out[f"{name}_observed"] = torch.zeros_like(data[f"{name}_observed"])
@@ -96,7 +96,7 @@ def without(data: TensorDict, *sensors: str) -> TensorDict:
 def faulty(
     task: Task, data: TensorDict, sensor: str, fault: str, begin: Tensor, end: Tensor, generator: torch.Generator
 ) -> TensorDict:
-    """The recordings with one sensor out of order from ``begin`` to ``end`` ``[N]``, which its mask does not tell."""
+    """Returns the recordings with an unmasked fault of one sensor from ``begin`` to ``end`` ``[N]``."""
     time = torch.arange(data.shape[1]).unsqueeze(0)
     bad = ((time >= begin.unsqueeze(-1)) & (time < end.unsqueeze(-1))).unsqueeze(-1)
     reading = data[sensor]
@@ -113,7 +113,7 @@ def faulty(
 
 
 def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
-    """The recordings with one sensor's readings so many steps late."""
+    """Returns the recordings with one sensor's readings ``steps`` late."""
     out = data.copy()
     for key in (sensor, f"{sensor}_observed", f"{sensor}_features"):
         out[key] = data[key].roll(steps, 1)
@@ -123,10 +123,10 @@ def delayed(data: TensorDict, sensor: str, steps: int) -> TensorDict:
 
 
 def add_features(data: TensorDict, noises: Mapping[str, Tensor]) -> TensorDict:
-    """Adds what tells of a frozen or a noisy sensor, ``NAME_features`` ``[N, T, O + 1]``.
+    """Adds features ``NAME_features`` ``[N, T, O + 1]`` that detect a frozen or a noisy sensor.
 
-    They are how much each component of its last readings differs, a logarithm of standard deviations, and how many of
-    them are exactly the present one. The sensor's readings are held between the steps at which they are taken.
+    They are the logarithm of the mean change of each component over the last readings, in standard deviations, and the
+    number of last readings that equal the present one exactly. Between readings the features stay the same.
 
     Args:
         data: recordings ``[N, T]``.
@@ -153,7 +153,7 @@ def add_features(data: TensorDict, noises: Mapping[str, Tensor]) -> TensorDict:
 
 
 def last_seen(data: TensorDict, sensor: str) -> Tensor:
-    """The step of a sensor's last reading at each time, ``[N, T, 1]``; 0 before the first."""
+    """Returns the step of a sensor's last reading at each time, ``[N, T, 1]``; 0 before the first."""
     seen = data[f"{sensor}_observed"]
     time = torch.arange(data.shape[1]).reshape(1, -1, 1).expand_as(seen)
     return torch.where(seen, time, 0).cummax(1).values

@@ -1,4 +1,4 @@
-"""The training of what is little: the noise of each sensor and of the motion, and the weights between sensors."""
+"""Trains the noise of each sensor and of the motion, and the attention weights between sensors."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from benchmarks.common.descent import minimise
 from benchmarks.fusion.task import FAULTS, Task, faulty, without
 from torch_denkf.fusion import SensorAttention
 
-FLOOR = 1e-4  # of the weights: the encoders read eight times as often as the camera, and are ten times as exact
+FLOOR = 1e-4  # smallest weight: the encoders run at eight times the camera's rate, with a tenth of its noise
 
 
 def make_weights(task: Task, seed: int = 0) -> SensorAttention:
-    """The network of a task's weights, untrained."""
+    """Returns the untrained attention network of a task."""
     torch.manual_seed(seed)
     sizes = {name: len(noise) for name, noise in task.noises.items()}
     features = {name: task.train[f"{name}_features"].shape[-1] for name in sizes}
@@ -26,18 +26,18 @@ def make_weights(task: Task, seed: int = 0) -> SensorAttention:
 
 
 def train(task: Task, weights: nn.Module, *, updates: tuple[int, int], window: int, batch: int, seed: int = 0) -> None:
-    """Trains the noise, and then the weights, on windows in which a sensor fails, both in place.
+    """Trains the noise, then the attention network on windows with sensor faults; both in place.
 
-    In a third of the windows one sensor is absent, so that the others are trained alone. In a half of those for the
-    weights one fails. The start-up of a window is not scored, and nothing fails in it.
+    In a third of the windows one sensor is absent, so that the others are trained without it. In half of the windows
+    for the attention network one sensor fails. The start-up of a window has no fault and is not scored.
 
     Args:
         task: the task.
-        weights: the network of the weights.
-        updates: of the noise, and of the weights.
-        window: steps.
+        weights: the attention network.
+        updates: number of updates of the noise, and of the attention network.
+        window: length of a window in steps.
         batch: windows in an update.
-        seed: of the windows and their faults.
+        seed: draws the windows and their faults.
     """
     generator, settled = torch.Generator().manual_seed(seed), task.settled
 

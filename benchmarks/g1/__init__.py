@@ -1,1 +1,1 @@
-"""Study: a real arm that its head camera watches."""
+"""Study of a real arm seen by the robot's head camera."""

@@ -26,7 +26,7 @@ FAIRNESS = (
 
 
 def smoke(study: Study) -> Study:
-    """Everything once, on a drawn robot with small pictures."""
+    """Returns a tiny study of everything, on small synthetic images."""
     tiny = {"drawn": True, "size": (36, 48), "tune": 3, "validation": 2, "seeds": (0,)}
     budget = FilterBudget(motion=5, spread=20, filter=2, length=6, batch=4)
     out = Path(tempfile.mkdtemp(prefix="g1-"))

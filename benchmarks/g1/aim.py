@@ -1,4 +1,4 @@
-"""Finds the hand in the picture without a label: where pictures change while the arm moves."""
+"""Finds the hand in the image without labels, from the changes of the image while the arm moves."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from torch.nn.functional import avg_pool2d
 
 from torch_denkf.data import LeRobotReplay
 
-APART = 4  # rows between two pictures that are compared
-NOISE = 12 / 255  # a change below is the camera's noise
-MOVING = 0.6  # of all pairs those count that change most
+APART = 4  # rows between two compared images
+NOISE = 12 / 255  # smaller changes are the camera's noise
+MOVING = 0.6  # share of the pairs that are used, those with the largest changes
 
 
 class HandPlace:
-    """The middle of what changes in the picture, as a function of the joints.
+    """Regression of the hand's place in the image on the joints.
 
-    What moves in these recordings is the right arm, and what it holds. The middle of the change between two pictures,
-    regressed on the joints and their products, is the hand's back: by it a sensor learns where to look closely, and a
-    box is put over the hand.
+    Only the right arm and the object in its hand move in these recordings. The centroid of the change between two
+    images, regressed on the joints and their products, is the back of the hand. It is the target for the patch of the
+    sensor, and the place of the box in the tests.
 
     Args:
         data: the recordings.
@@ -55,5 +55,5 @@ class HandPlace:
         return torch.cat([torch.ones_like(z[..., :1]), z, products[..., upper]], -1)
 
     def __call__(self, joints: Tensor) -> Tensor:
-        """Columns and rows ``[*, 2]`` from -1 (left, top) to 1, of joints ``[*, J]``."""
+        """Returns columns and rows ``[*, 2]`` from -1 (left, top) to 1, for joints ``[*, J]``."""
         return self._features(joints) @ self.weights

@@ -1,4 +1,4 @@
-"""Holds what all filters of a seed share: sensor, statistics, the hand's place, features of the pictures."""
+"""Inputs that all filters of a seed share: sensor, statistics, the hand's place, features of the images."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHECKED = 1200  # frames that a sensor is validated on
 
 @dataclass(frozen=True)
 class SensorBudget:
-    """Updates of a sensor, and frames in each; networks that read together, trained from different random numbers."""
+    """Updates of a sensor, frames in each, and the number of its networks, which have different seeds."""
 
     updates: int = 2400
     frames: int = 32
@@ -34,12 +34,12 @@ class SensorBudget:
 
 
 class TrainedSensor:
-    """A sensor and what belongs to it.
+    """A sensor with its training data and its features.
 
     Args:
         recordings: the study's.
         seed: of roles and of all random numbers.
-        budget: updates.
+        budget: of the sensor's training.
     """
 
     def __init__(self, recordings: Recordings, seed: int, budget: SensorBudget):
@@ -49,17 +49,17 @@ class TrainedSensor:
 
     @cached_property
     def roles(self) -> Roles:
-        """Who trains, tunes, validates, is tested."""
+        """Returns the episodes for training, tuning, validation and test."""
         return self.recordings.roles(self.seed)
 
     @cached_property
     def hand(self) -> HandPlace:
-        """Returns the hand's place in the picture, of the arm's joints."""
+        """Returns the regression of the hand's place in the image on the arm's joints."""
         data = self.recordings.data
         return HandPlace(data, rows_of(data, self.roles.sensor), data.storage[:]["state"][:, list(ARM)])
 
     def pool(self, numbers: list[int], most: int | None = None) -> FramePool:
-        """Frames of episodes that have a new picture, at most about so many."""
+        """Returns frames of episodes with a new image, at most about ``most``."""
         data, rows = self.recordings.data, rows_of(self.recordings.data, numbers)
         rows = rows[data.storage[:]["observed"].squeeze(-1)[rows]]
         rows = rows[:: max(len(rows) // most, 1)] if most else rows
@@ -68,7 +68,7 @@ class TrainedSensor:
 
     @cached_property
     def trained(self) -> tuple[list[ImageSensor], Statistics]:
-        """The trained networks. Their statistics lie beside them: a resumed study does not read the pictures."""
+        """Returns the trained networks, with saved statistics, so that a resumed study reads no images."""
         folders, facts_file = [self.out / str(k) for k in range(self.budget.networks)], self.out / "facts.pt"
         done = facts_file.exists() and all((folder / "sensor.pt").exists() for folder in folders)
         train = held_out = None
@@ -90,7 +90,7 @@ class TrainedSensor:
         return sensors, facts
 
     def codes(self, role: str, condition: str = "clean") -> TensorDict:
-        """Features of the episodes of a role ``[N, T]`` in some pictures, with joints, rates and commands."""
+        """Returns features of a role's episodes ``[N, T]`` under a condition, with joints, rates and commands."""
         data, exact = self.recordings.data, role == "test"
 
         def see(rows: TensorDict) -> TensorDict:
@@ -108,7 +108,7 @@ class TrainedSensor:
         return codes.set("action", delayed(codes["action"]))
 
     def sequences(self) -> list[tuple[Tensor, Tensor]]:
-        """True joints and commands of the sensor's and the filters' training episodes, ``[T, D]`` each."""
+        """Returns true joints and commands of the sensor's and the filters' training episodes, ``[T, D]`` each."""
         data = self.recordings.data
         both = [data.storage[:][key][:, list(ARM)] for key in ("state", "action")]
         rows = [rows_of(data, [number]) for number in (*self.roles.sensor, *self.roles.tune)]

@@ -1,4 +1,4 @@
-"""Estimates without a filter: do the pictures say anything, and does a filter say more than its sensor?"""
+"""Baselines without a filter: the mean pose, the sensor alone, and its last reading."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from torch_denkf.training.parts import train_part
 
 
 def seen_pairs(readings: Sequence[TensorDict]) -> TensorDict:
-    """Encodings and errors of all frames that are seen, ``[M]``."""
+    """Returns encodings and errors of all observed frames, ``[M]``."""
     parts = torch.cat([one[one["observed"].squeeze(-1)] for one in readings])
     error = parts["sensor", "ensemble"].mean(-2) - parts["state"]
     return TensorDict({"encoding": parts["sensor", "encoding"], "error": error}, parts.shape)
 
 
 class SensorSpread:
-    """The variance of a sensor's error, from what it saw: fitted on the tuning episodes.
+    """Model of the variance of a sensor's error given its encoding, fitted on the tuning episodes.
 
-    A sensor's samples say how its weights' noise spreads, not how wrong it is on episodes it has not seen.
+    The spread of a sensor's samples comes from the noise of its weights, and underestimates its error on new episodes.
 
     Args:
-        tune: readings of the tuning episodes, in all pictures.
-        validation: of the validation episodes; they choose when to stop, and a factor for the coverage.
+        tune: readings of the tuning episodes, under all image conditions.
+        validation: of the validation episodes, for early stopping and a factor for the coverage.
         out: folder of the fit.
         updates: of the fit.
     """
@@ -63,13 +63,13 @@ class SensorSpread:
 
     @torch.no_grad()
     def __call__(self, readings: TensorDict) -> Tensor:
-        """Variances ``[N, T, D]``."""
+        """Returns variances ``[N, T, D]``."""
         features = readings["sensor", "encoding"]
         return self.factor**2 * self._variance(features.flatten(0, 1)).unflatten(0, features.shape[:2])
 
 
 def baselines(readings: TensorDict, sequences: Sequence[Tensor], spread: SensorSpread) -> dict[str, TensorDict]:
-    """Beliefs ``[N, T]`` of all baselines, by name.
+    """Returns beliefs ``[N, T]`` of all baselines, by name.
 
     Args:
         readings: of the sensor.
@@ -81,7 +81,7 @@ def baselines(readings: TensorDict, sequences: Sequence[Tensor], spread: SensorS
     mean, var = (value.expand_as(truth) for value in (flat.mean(0), flat.var(0)))
     read, read_var = readings["sensor", "ensemble"].mean(-2), spread(readings)
     held = hold_last(read, seen, start.expand_as(truth[:, 0])), hold_last(read_var, seen, var[:, 0])
-    # The sensor knows nothing where no picture arrives.
+    # Without an image the sensor alone falls back to the mean pose.
     alone = torch.where(there, read, mean), torch.where(there, read_var, var)
     found = {"mean_pose": (mean, var), "sensor": alone, "held": held}
     return {name: estimated(readings, *moments) for name, moments in found.items()}

@@ -1,4 +1,4 @@
-"""Disturbs the camera's pictures: in training at random, in tests one by one."""
+"""Disturbs the camera's images: in training at random, in tests one by one."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from torch import Tensor
 
 from torch_denkf.envs import SaltAndPepper
 
-BOX = 0.3  # side of a box over the hand, in widths of the picture
-SHIFT = 10 / 320  # of a camera that was pushed, in widths of the picture
-DARK = 0.45  # share of the light that is left
-PICTURES = ("clean", "salt_and_pepper", "box", "shifted", "dark")  # conditions that change pictures
-MARGIN = (0.16, 0.3)  # between the hand's middle and another episode's table, in widths of the picture
+BOX = 0.3  # side of a box over the hand, in widths of the image
+SHIFT = 10 / 320  # of a camera that was pushed, in widths of the image
+DARK = 0.45  # share of the light that remains
+PICTURES = ("clean", "salt_and_pepper", "box", "shifted", "dark")  # conditions that change images
+MARGIN = (0.16, 0.3)  # between the hand's middle and another episode's table, in widths of the image
 
 
 def shifted(pixels: Tensor, right: int, down: int) -> Tensor:
-    """Pictures ``[*, H, W]`` moved by whole pixels; the edges are repeated."""
+    """Returns images ``[*, H, W]`` moved by whole pixels; the edges are repeated."""
     height, width = pixels.shape[-2:]
     rows = (torch.arange(height) - down).clamp(0, height - 1)
     columns = (torch.arange(width) - right).clamp(0, width - 1)
@@ -24,7 +24,7 @@ def shifted(pixels: Tensor, right: int, down: int) -> Tensor:
 
 
 def boxed(pixels: Tensor, place: Tensor, side: float = BOX) -> Tensor:
-    """Pictures ``[N, 3, H, W]`` with a black box around places ``[N, 2]`` from -1 (left, top) to 1."""
+    """Returns images ``[N, 3, H, W]`` with a black box around places ``[N, 2]`` from -1 (left, top) to 1."""
     height, width = pixels.shape[-2:]
     half = side * width / 2
     column, row = (place[:, 0] + 1) / 2 * width, (place[:, 1] + 1) / 2 * height
@@ -34,15 +34,16 @@ def boxed(pixels: Tensor, place: Tensor, side: float = BOX) -> Tensor:
 
 
 def before_another(pixels: Tensor, place: Tensor, other: Tensor, margin: float) -> Tensor:
-    """The arm of one picture before the table of another, uint8 ``[3, H, W]``.
+    """Returns the arm of one image in front of the table of another, uint8 ``[3, H, W]``.
 
-    The arm reaches in from the right and from below. What is left of the hand or above it comes from the other picture.
+    The arm reaches in from the right and from below. The region to the left of the hand or above it comes from the
+    other image.
 
     Args:
         pixels: with the arm.
         place: of the hand, ``[2]`` from -1 (left, top) to 1.
         other: with the table.
-        margin: kept around the hand's middle, in widths of the picture.
+        margin: kept around the hand's middle, in widths of the image.
     """
     height, width = pixels.shape[-2:]
     column, row = (float(place[0]) + 1) / 2 * width, (float(place[1]) + 1) / 2 * height
@@ -53,7 +54,7 @@ def before_another(pixels: Tensor, place: Tensor, other: Tensor, margin: float) 
 
 
 def disturb(pixels: Tensor, place: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Training frames: other light and colours for all; noise, shifts, boxes, salt and pepper for some.
+    """Augments training frames: light and colours of all; noise, shifts, boxes, salt and pepper in some.
 
     Args:
         pixels: uint8 ``[N, 3, H, W]``; changed in place.
@@ -61,7 +62,7 @@ def disturb(pixels: Tensor, place: Tensor, generator: torch.Generator) -> tuple[
         generator: of all random numbers.
 
     Returns:
-        The frames, about in [0, 1], and how far the hand moved in them, ``[N, 2]``.
+        The frames, about in [0, 1], and the hand's displacement in them, ``[N, 2]``.
     """
     count, height, width = len(pixels), *pixels.shape[-2:]
 
@@ -91,14 +92,14 @@ def disturb(pixels: Tensor, place: Tensor, generator: torch.Generator) -> tuple[
 
 
 def failing(pixels: Tensor, place: Tensor, condition: str, draw: Tensor, exact: bool) -> Tensor:
-    """Pictures of a failing camera.
+    """Returns images of a failing camera.
 
     Args:
         pixels: ``[N, 3, H, W]`` in [0, 1].
         place: of the hand, ``[N, 2]``.
         condition: one of :data:`PICTURES`.
-        draw: four numbers in [0, 1) that say how it fails in this episode.
-        exact: as in the tests, instead of by the draw: box and light as large as there, a shift of 10 px of 320.
+        draw: four numbers in [0, 1) that set size and direction of the failure in this episode.
+        exact: whether sizes are those of the tests instead of drawn ones: box, light, a shift of 10 px of 320.
     """
     first, second, third, fourth = draw.tolist()
     if condition == "salt_and_pepper":

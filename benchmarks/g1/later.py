@@ -1,8 +1,8 @@
-"""The joints of a moment to come: encoders, the commands that are under way, and a belief ahead.
+"""Predicts future joints from encoders and from the commands that are not yet executed.
 
-``python -m benchmarks.g1.later --root G1``. It reads no pictures. The state is the joints of a row and of the row
-before; the motion, which also reads the row's commands, is fitted by least squares, and its noise by what it leaves. A
-factor on that noise is chosen on validation episodes, so that 90 % of the intervals of the later moment hold the truth.
+``python -m benchmarks.g1.later --root G1``. It reads no images. The state is the joints of a row and of the row
+before; the motion, which also reads the row's commands, is fitted by least squares, its noise to the residuals. A
+factor on that noise is chosen on validation episodes, for a 90 % coverage at the predicted time.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from torch_denkf.filters import Filter
 from torch_denkf.fusion import BeliefAhead, FusedFilter, FusedSensor
 from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, LinearTransition, MomentPrior, Select
 
-RATE, LEVEL = 30, 1.6449  # rows a second; of a normal distribution, the 90 % interval
+RATE, LEVEL = 30, 1.6449  # rows per second; of a normal distribution, the 90 % interval
 ENCODER = 0.1 * torch.pi / 180  # noise of the encoders, a standard deviation in rad
-FIRST = 15  # rows after which a filter is scored: it has forgotten its start
+FIRST = 15  # first scored row, after which the initial belief has no influence
 FACTORS = (1.0, 1.2, 1.4, 1.7, 2.0)  # on the standard deviations of the motion's noise
 MEMBERS = 64
 
 
 @dataclass(frozen=True)
 class Later:
-    """Options of the study of later moments."""
+    """Options of the study of predictions."""
 
     root: Path = Path("../shared/data/g1")  # LeRobot folder
-    page: Path | None = None  # where to leave the table
-    rows: tuple[int, ...] = (3, 6, 12)  # how far to look ahead, in rows of 1/30 s
+    page: Path | None = None  # file for the table
+    rows: tuple[int, ...] = (3, 6, 12)  # prediction horizons, in rows of 1/30 s
     chosen: int = 6  # rows ahead at which the factor is chosen
 
 
 def episodes(root: Path) -> dict[str, TensorDict]:
-    """Joints and commands by role, ``[B, T]``, in rad; ``valid`` says where an episode is."""
+    """Returns joints and commands by role, ``[B, T]``, in rad; ``valid`` masks the padding after an episode."""
     found: dict[str, list[Tensor]] = {"train": [], "validation": [], "test": []}
     for file in sorted((root / "data").glob("*/*.parquet")):
         number, table = int(file.stem.rpartition("_")[-1]), read_parquet(file, ["observation.state", "action"])
@@ -68,8 +68,8 @@ class Motion:
     """A linear motion of the joints around their mean.
 
     Attributes:
-        weight: ``[7, 21]``, of the joints, those of the row before, and the commands.
-        noise: covariance of what it leaves, ``[7, 7]``.
+        weight: ``[7, 21]``, for the joints, those of the row before, and the commands.
+        noise: covariance of the residuals, ``[7, 7]``.
         center: mean of the joints, ``[7]``.
     """
 
@@ -79,7 +79,7 @@ class Motion:
 
     @classmethod
     def fitted(cls, data: TensorDict) -> Motion:
-        """By least squares."""
+        """Fits the motion by least squares."""
         whole = data["valid"][:, 2:]
         center = data["joints"][data["valid"]].mean(0)
         joints, commands = data["joints"] - center, data["action"] - center
@@ -90,7 +90,7 @@ class Motion:
         return cls(weight.mT, left.mT @ left / len(left), center)
 
     def filter(self, kind: str, factor: float) -> Filter:
-        """A filter of joints and those of the row before; ``kind`` is ``"EKF"`` or ``"DEnKF"``."""
+        """Returns a filter of the joints of this row and the last; ``kind`` is ``"EKF"`` or ``"DEnKF"``."""
         passed = torch.eye(JOINTS, 2 * JOINTS)
         matrix = torch.cat([self.weight[:, : 2 * JOINTS], passed])
         control = torch.cat([self.weight[:, 2 * JOINTS :], torch.zeros(JOINTS, JOINTS)])
@@ -114,14 +114,14 @@ class Motion:
         )
 
     def centered(self, data: TensorDict, ahead: int) -> TensorDict:
-        """Returns what a filter reads, with the commands under way; those of the last rows are missing."""
+        """Returns a filter's inputs, with the commands ``ahead`` rows on; those of the last rows wrap around."""
         drive = TensorDict({key: data[key] - self.center for key in ("encoders", "action")}, data.batch_size)
         waiting = [drive["action"].roll(-k, 1) for k in range(ahead)]
         return drive.set(("under_way", "action"), torch.stack(waiting, 2))
 
 
 def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: int) -> TensorDict:
-    """The belief now, and those of the next rows ``[B, T, steps, 14]``."""
+    """Returns the belief now, and those of the next rows ``[B, T, steps, 14]``."""
     filter = motion.filter(kind, factor)
     ahead = BeliefAhead(filter, steps, each=True, keep=[("belief", "mean"), ("belief", "var")])
     with torch.no_grad():
@@ -129,7 +129,7 @@ def looked(motion: Motion, data: TensorDict, kind: str, factor: float, steps: in
 
 
 def scores(motion: Motion, data: TensorDict, out: TensorDict, ahead: int) -> tuple[float, ...]:
-    """Errors of the belief of the last reading and of the belief ahead, in degrees, and the share within 90 %."""
+    """Returns errors of the last belief and of the predicted belief, in degrees, and the 90 % coverage."""
     last = data["valid"].shape[1] - ahead
     rows = data["valid"][:, ahead:] & (torch.arange(last) >= FIRST)
     truth = (data["joints"] - motion.center)[:, ahead:][rows]
@@ -144,7 +144,7 @@ def main() -> None:
     """Writes the table."""
     study = parse(Later)
     torch.manual_seed(0)
-    torch.set_default_dtype(torch.float64)  # encoders of 0.1 degrees, and a start that knows nothing
+    torch.set_default_dtype(torch.float64)  # for encoders of 0.1 degrees with a wide initial belief
     data = episodes(study.root)
     motion = Motion.fitted(data["train"])
     counts = ", ".join(f"{len(part)} {role}" for role, part in data.items())

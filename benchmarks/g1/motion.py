@@ -1,4 +1,4 @@
-"""The motion that all filters learn: rates that last, and a pull to the commands where those are read."""
+"""Learned motion model of all filters: damped rates, and a pull to the commands if those are read."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from benchmarks.common.arm import JOINTS
 from benchmarks.common.arm.motion import ArmMotion
 from benchmarks.common.arm.sensors import Statistics
 
-DELAYS = (0, 2)  # rows: the robot follows a command after some
-AHEAD = 8  # rows that the motion runs by itself in training
+DELAYS = (0, 2)  # rows: latency of the commands
+AHEAD = 8  # rows of open-loop prediction in training
 
 
 def delayed(actions: Tensor) -> Tensor:
-    """Commands ``[*, T, 2D]`` of sequences ``[*, T, D]``: those of the row, and those of some rows before."""
+    """Returns commands ``[*, T, 2D]`` from sequences ``[*, T, D]``: those of the row, and those of 2 rows before."""
     rows = torch.arange(actions.shape[-2])
     return torch.cat([actions[..., (rows - delay).clamp_min(0), :] for delay in DELAYS], -1)
 
 
 class Motion(ArmMotion):
-    r"""One row on, of the joints and the change of each in the last row.
+    r"""Predicts the next joints, from the joints and their change in the last row.
 
     .. math:: c_t = d \circ c_{t-1} + \sum_k p_k \circ (u_{t-1-k} - q_{t-1}) + a(q, c, u), \quad q_t = q_{t-1} + c_t
 
@@ -37,11 +37,11 @@ class Motion(ArmMotion):
         units = {name: getattr(facts, name)[:JOINTS] for name in ("loc", "scale", "rate", "acceleration")}
         super().__init__((2 + len(DELAYS) * actions) * JOINTS, **units)
         self.actions = actions
-        self.damping = nn.Parameter(torch.full((JOINTS,), 3.0))  # of it the sigmoid
+        self.damping = nn.Parameter(torch.full((JOINTS,), 3.0))  # logit
         self.pull = nn.Parameter(torch.zeros(len(DELAYS), JOINTS)) if actions else None
 
     def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, 2D]`` of states ``[*, 2D]``, or of states and commands ``[*, 4D]``."""
+        """Returns the next states ``[*, 2D]`` from states ``[*, 2D]``, or from states and commands ``[*, 4D]``."""
         place, rates = features[..., :JOINTS], features[..., JOINTS : self.size]
         parts = [(place - self.loc) / self.scale, (rates / (3 * self.rate)).tanh()]
         wanted = self.damping.sigmoid() * rates

@@ -1,4 +1,4 @@
-"""Filters by name. One of your own: a :class:`G1Recipe` with ``@register``."""
+"""Filters by name. To add a filter, decorate a :class:`G1Recipe` with ``@register``."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from torch_denkf.modules import AroundState, DiagonalNoise, GaussianAround, Nois
 from torch_denkf.modules.particles import with_weights
 from torch_denkf.objectives import GaussianLoss
 
-# Of the sensor's errors little is new in each frame: on validation episodes neighbours correlate by 0.97 to 0.98.
+# Shares of the sensor's errors that are white and slow: on validation episodes neighbours correlate by 0.97 to 0.98.
 WHITE, SLOW = 0.4, 0.92  # 0.4^2 + 0.92^2 = 1
-SURPRISE = 3.0  # changes of a rate, of those in the training episodes: what comes next is not white. See the README.
+SURPRISE = 3.0  # factor on the training episodes' accelerations for the process noise, see the README
 MEMBERS = 128  # of the ensemble filters, which read as many samples of the sensor
 TAPER = 0.5  # factor on the covariances of different joints
 SPREAD_CELLS = (16,)  # hidden layers of the sensor's spread
@@ -33,9 +33,9 @@ register = FILTERS.register
 
 
 class RatesAndBias(SubModel):
-    """Q of the rates from the belief's mean, and of the biases from what the sensor sees.
+    """Process noise of the rates, from the belief's mean, and of the biases, from the sensor's encoding.
 
-    A box over the hand makes a sensor wrong for as long as it is there: then the bias is large, not only R.
+    A box over the hand makes a sensor wrong for as long as it is there, so that the bias grows, not only R.
 
     Args:
         rates: reads the belief's mean.
@@ -47,7 +47,7 @@ class RatesAndBias(SubModel):
         super().__init__(parts, [*rates.in_keys, *bias.in_keys], rates.out_keys)
 
     def compute(self, mean, encoding, *, batch_size):
-        """Variances ``[*B, 2D]``."""
+        """Returns variances ``[*B, 2D]``."""
         rates = self.module["rates"].compute(mean, batch_size=batch_size)
         return torch.cat([rates, self.module["bias"].compute(encoding, batch_size=batch_size)], -1)
 
@@ -57,12 +57,12 @@ class G1Recipe(ArmRecipe):
 
     Args:
         motion: trained before; the filter gets a copy.
-        error: root mean square error of the sensor, ``[D]``, on episodes that it has not seen.
-        first: standard deviation of where episodes begin, ``[D]``.
+        error: root mean square error of the sensor, ``[D]``, on validation episodes.
+        first: standard deviation of the first joints of episodes, ``[D]``.
         spread: the variance of the sensor's errors as a function of its encoding, fitted before.
 
     Attributes:
-        longer: times as many updates as others.
+        longer: factor on the number of updates.
     """
 
     members, longer = MEMBERS, 1
@@ -72,21 +72,21 @@ class G1Recipe(ArmRecipe):
     def __init__(self, motion: Motion, error: Tensor, first: Tensor, spread: DiagonalNoise):
         self.motion, self.error, self.spread = deepcopy(motion), error, spread
         self.encoding, self.bias_std = len(spread.loc), SLOW * error
-        self.first_std = torch.cat([first, 0.3 * motion.rate])  # episodes begin where those of the training do
+        self.first_std = torch.cat([first, 0.3 * motion.rate])
         self.start_std = torch.cat([2**0.5 * error, motion.rate])
 
     def start(self, windows, generator):
-        # The start must say less than the sensor, or a filter learns to hold on to it, which fails in whole episodes.
+        # The start must be less certain than the sensor, or a filter learns to trust it, which fails in whole episodes.
         near = windows["sensor", "ensemble"][:, 0].mean(-2)
         near = near + self.error * torch.randn(near.shape, generator=generator)
         return near.unsqueeze(1).expand_as(windows["state"])
 
     def noise(self):
-        # All of the sensor's errors are white where the state holds no bias.
+        # Without a bias in the state, all of the sensor's errors are white.
         return ScaledNoise(self._of_sensor(WHITE if self.bias else 1.0, ("sensor", "noise")))
 
     def _of_sensor(self, share: float, out_key: NestedKey) -> DiagonalNoise:
-        """A share of the sensor's errors, from what it sees; before training as it was fitted."""
+        """Returns the sensor's noise model, scaled by ``share`` and initialised with its fit."""
         root = (self.spread.variance + self.spread.floor).sqrt()
         keys = {"in_features": self.encoding, "in_key": ("sensor", "encoding"), "out_key": out_key}
         noise = DiagonalNoise(JOINTS, r=share * root, num_cells=SPREAD_CELLS, **keys)
@@ -95,12 +95,12 @@ class G1Recipe(ArmRecipe):
 
     @property
     def noisy(self) -> list[int]:
-        """Dimensions of the state that the process noise acts on: the numbers follow from their rates."""
+        """Returns the dimensions with process noise: rates and biases. The joints follow from their rates."""
         return list(range(JOINTS, self.size))
 
     @property
     def process_std(self) -> Tensor:
-        """Returns what motion and bias do not know before training: accelerations; biases stay as large."""
+        """Returns the process noise before training: accelerations, and noise that keeps the biases' variance."""
         slow = (1 - self.motion.fading**2) ** 0.5 * self.bias_std
         return torch.cat([SURPRISE * self.motion.acceleration, slow])[: len(self.noisy)]
 
@@ -121,11 +121,11 @@ class G1Recipe(ArmRecipe):
 
 @register
 class DEnKF(recipes.DEnKF, G1Recipe):
-    """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples."""
+    """The differentiable ensemble Kalman filter, with innovations of the sensor's samples."""
 
     @property
     def taper(self) -> tuple[Tensor, Tensor]:
-        """An ensemble shows correlations of joints that are not there. Rates and biases go with their joint."""
+        """Returns factors that damp spurious correlations between joints. Rates and biases count as their joint."""
         readings = torch.where(torch.eye(JOINTS) > 0, 1.0, TAPER)
         return readings.repeat(self.size // JOINTS, 1), readings
 
@@ -156,7 +156,7 @@ class BKF(recipes.BKF, G1Recipe):
 class DPF_M(Particles, G1Recipe):
     """Kloss et al. 2021: Gaussian likelihood, soft resampling. Particles move by the learned motion."""
 
-    bias = False  # a hundred particles do not fill seven dimensions more
+    bias = False  # a hundred particles are too few for seven more dimensions
 
     def noisy_motion(self):
         return NoisyTransition(self.transition(), self.process_noise(), self.noisy, before=True)
@@ -167,7 +167,7 @@ class DPF_M(Particles, G1Recipe):
 
 @register
 class LSTM(G1Recipe):
-    """Reads encoding and reading. It knows no motion, and is trained for longer."""
+    """LSTM on the sensor's encoding and reading, without a motion model and with more updates."""
 
     bias = False
     longer = 6

@@ -15,19 +15,19 @@ from benchmarks.g1.recordings import FINGERS
 from torch_denkf.functional import crps_ensemble
 from torch_denkf.modules import ImageSensor, KeypointTrunk
 
-REACH = 0.34  # half a patch's side, in half widths of the picture: hand and wrist
-SAMPLES = 16  # of a sensor while it is trained
-ELSEWHERE = 0.4  # of the training frames are put before the table of another episode
-# What a good sensor leaves: units of all losses. 1.15 degrees; a twentieth of the way of a finger.
+REACH = 0.34  # half a patch's side, in half widths of the image: hand and wrist
+SAMPLES = 16  # of a sensor in training
+ELSEWHERE = 0.4  # share of the training frames that get the table of another episode
+# Units of all losses, the errors of a good sensor: 1.15 degrees; a twentieth of a finger's range.
 JOINT_UNIT, FINGER_UNIT = 0.02, 0.05
 UNIT = torch.cat([torch.full((JOINTS,), JOINT_UNIT), torch.full((FINGERS,), FINGER_UNIT)])
 
 
 class HalfKeypointTrunk(KeypointTrunk):
-    """Keypoints with convolutions of 16 bits: half the time on a processor that has them. Places keep 32 bits."""
+    """Keypoint trunk with 16-bit convolutions, twice as fast on a processor that supports them; places have 32 bits."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """Features of images."""
+        """Returns features of images."""
         height, width = images.shape[-2:]
         rows, columns = torch.linspace(-1, 1, height), torch.linspace(-1, 1, width)
         grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy")).expand(len(images), -1, -1, -1)
@@ -38,11 +38,11 @@ class HalfKeypointTrunk(KeypointTrunk):
 
 
 def build_sensor(facts: Statistics) -> ImageSensor:
-    """Builds keypoints and a second look at the hand. Flipout learns how large its noise is."""
+    """Builds a sensor of keypoints and a patch around the hand, with a flipout head that learns its noise."""
     keypoints = HalfKeypointTrunk(3, channels=(32, 48, 96, 128), keypoints=64, features=192)
     close = CloseLook(facts.size[1], REACH, dropout=0.2, half=True)
     trunk = GlimpseTrunk(nn.Sequential(nn.AvgPool2d(2), keypoints), close, 192, dropout=0.1, told=True)
-    # Measured on one thread of an EPYC: 244 ms an update of 32 frames as ImageSensor has it by default, 153 like this.
+    # On one thread of an EPYC an update of 32 frames takes 244 ms with ImageSensor's defaults, 153 ms with these.
     head = {"num_cells": (128, 64), "layer": "flipout", "trunk_memory": 2**34}
     sensor = camera_sensor(facts, trunk, SAMPLES, facts.loc, facts.scale, **head)
     sensor.module["trunk"].to(memory_format=torch.contiguous_format)
@@ -50,7 +50,7 @@ def build_sensor(facts: Statistics) -> ImageSensor:
 
 
 class FrameLoss(nn.Module):
-    """CRPS of a sensor's samples in units of a good sensor's errors; and where it looks closely."""
+    """CRPS of a sensor's samples in units of a good sensor's errors, and the error of its patch's place."""
 
     def __init__(self, sensor: ImageSensor):
         super().__init__()
@@ -72,8 +72,8 @@ class FramePool:
 
     Args:
         pixels: uint8 ``[N, 3, H, W]``.
-        target: what is to be read, ``[N, 13]``.
-        place: where the hand is in the picture, ``[N, 2]``.
+        target: true reading, ``[N, 13]``.
+        place: of the hand in the image, ``[N, 2]``.
         episode: ``[N]``.
     """
 
@@ -84,12 +84,12 @@ class FramePool:
         return len(self.target)
 
     def rows(self, index: Tensor) -> TensorDict:
-        """Frames as they are, ``[n]``."""
+        """Returns frames without augmentation, ``[n]``."""
         rows = {"pixels": self.pixels[index].float() / 255, "target": self.target[index], "place": self.place[index]}
         return TensorDict(rows, batch_size=[len(index)])
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
-        """Random disturbed frames ``[batch]``, some before the table of another episode."""
+        """Returns random augmented frames ``[batch]``, some with the table of another episode."""
         index = torch.randint(len(self), (batch,), generator=generator)
         rows = {"target": self.target[index], "place": self.place[index]}
         pixels, moved = disturb(self._elsewhere(index, generator), self.place[index], generator)
@@ -97,7 +97,7 @@ class FramePool:
         return TensorDict({**rows, "pixels": pixels}, batch_size=[batch])
 
     def _elsewhere(self, index: Tensor, generator: torch.Generator) -> Tensor:
-        # A sensor knows its few episodes by their tables. Most of the others' hands are at about the same place.
+        # A sensor could recognise its few episodes by their tables. Most other hands are at about the same place.
         pixels = self.pixels[index]
         for k in (torch.rand(len(index), generator=generator) < ELSEWHERE).nonzero().flatten().tolist():
             others = torch.randint(len(self), (400,), generator=generator)

@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from benchmarks.g1.recordings import NAMES, Recordings
 from torch_denkf.filters import Filter
 
 CONDITIONS = ("clean", "black20", "missing", *PICTURES[1:])
-SHARES = (0.5, 0.08, 0.22, 0.12, 0.08)  # of the windows that filters learn from, by PICTURES
+SHARES = (0.5, 0.08, 0.22, 0.12, 0.08)  # of the filters' training windows, by PICTURES
 INFLATIONS = (0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1)
 score_row = partial(scores.score_row, names=NAMES, unit=torch.full((JOINTS,), torch.pi / 180))
 
 
 @dataclass(frozen=True)
 class FilterBudget:
-    """Updates of each stage; the filter's windows."""
+    """Updates of each stage, and the size of the filter's windows."""
 
     motion: int = 1500  # updates of the motion on true states
     spread: int = 600  # updates of the sensor's variance
     filter: int = 45  # updates of a filter on readings
     length: int = 64  # rows of the filter's windows
-    batch: int = 8  # windows an update
+    batch: int = 8  # windows in an update
 
 
 @dataclass(frozen=True)
 class Study(Recordings):
-    """A real arm that its head camera watches: seven joints, with every filter that is registered.
+    """Estimates seven joints of a real arm from its robot's head camera, with every registered filter.
 
-    table: estimate the lag, train sensors and filters, test. diagnosis: how the trained sensors err. pictures: plots
-    of what a table left in --out. What was broken off goes on where it stopped. See benchmarks/g1/README.md.
+    table: train sensors and filters, test. diagnosis: correlation of the trained sensors' errors in time. pictures:
+    plots of the beliefs that a table saved in --out. An interrupted run resumes. See benchmarks/g1/README.md.
     """
 
     command: Positional[Literal["table", "diagnosis", "pictures"]] = "table"
@@ -54,11 +54,11 @@ class Study(Recordings):
     seeds: tuple[int, ...] = (0, 1, 2)
     sensor_budget: OmitArgPrefixes[SensorBudget] = field(default_factory=SensorBudget)
     budget: OmitArgPrefixes[FilterBudget] = field(default_factory=FilterBudget)
-    smoke: bool = False  # a tiny run of everything, on a drawn robot
+    smoke: bool = False  # a tiny run of everything, on synthetic images
 
 
 class Base:
-    """Holds what all filters of a seed share.
+    """Readings, motion and error model that all filters of a seed share.
 
     Args:
         study: the study.
@@ -72,7 +72,7 @@ class Base:
         self.motion = cache(self._motion)
 
     def _pictures(self, role: str) -> dict[str, TensorDict]:
-        """Returns what the sensor reads of the episodes of a role in all pictures; encodings as they are."""
+        """Returns the sensor's readings of a role's episodes under all image conditions, with raw encodings."""
         out = {}
         for condition in PICTURES:
             readings = read_all(self.trained.trained[0], self.trained.codes(role, condition), MEMBERS)
@@ -89,12 +89,12 @@ class Base:
 
     @cached_property
     def _encoding(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the encodings of the tuning episodes, in all pictures."""
+        """Returns mean and standard deviation of the tuning episodes' encodings under all image conditions."""
         seen = torch.cat([one["sensor", "encoding"][one["observed"].squeeze(-1)] for one in self._tune.values()])
         return seen.mean(0), seen.std(0).clamp_min(1e-3)
 
     def readings(self, role: str) -> dict[str, TensorDict]:
-        """Returns what the sensor reads of a role's episodes in all conditions, with encodings of variance one."""
+        """Returns the sensor's readings of a role's episodes under all conditions, with normalised encodings."""
         pictures, (loc, scale), out = self._tune if role == "tune" else self._pictures(role), self._encoding, {}
         for condition, one in pictures.items():
             sensor = one["sensor"].copy()
@@ -104,27 +104,27 @@ class Base:
 
     @cached_property
     def tune(self) -> dict[str, TensorDict]:
-        """Readings that filters are trained on."""
+        """Returns the readings for training filters."""
         return self.readings("tune")
 
     @cached_property
     def validation(self) -> dict[str, TensorDict]:
-        """Readings to choose by."""
+        """Returns the readings for validation."""
         return self.readings("validation")
 
     @cached_property
     def test(self) -> dict[str, TensorDict]:
-        """Readings of the test episodes."""
+        """Returns readings of the test episodes."""
         return self.readings("test")
 
     @cached_property
     def spread(self) -> SensorSpread:
-        """The variance of the sensor's errors."""
+        """Returns the model of the variance of the sensor's errors."""
         tune, validation = ([one[name] for name in PICTURES] for one in (self.tune, self.validation))
         return SensorSpread(tune, validation, self.study.out / "spreads" / self.name, self.study.budget.spread)
 
     def _motion(self, actions: bool) -> Motion:
-        """The motion, trained once on true states."""
+        """Returns the motion, trained once on true states."""
         seed, study = self.trained.seed, self.study
         torch.manual_seed(seed)
         paths = [torch.cat([with_rates(state, 1), delayed(action)], -1) for state, action in self.sequences]
@@ -133,7 +133,7 @@ class Base:
         return train_motion(motion, paths, AHEAD, out=out, seed=seed, updates=study.budget.motion)
 
     def train(self, name: str) -> tuple[G1Recipe, Filter]:
-        """Trains a filter, or reads it."""
+        """Trains a filter, or loads it."""
         kind, budget, clean = FILTERS[name], self.study.budget, self.validation["clean"]
         wrong = (clean["sensor", "ensemble"].mean(-2) - clean["state"])[clean["observed"].squeeze(-1)]
         error, first = wrong.square().mean(0).sqrt().clamp_min(1e-4), self.starts.std(0).clamp_min(1e-3)
@@ -152,12 +152,12 @@ class Base:
 
 
 def joined(readings: dict[str, TensorDict]) -> TensorDict:
-    """Readings of all conditions as one batch."""
+    """Returns readings of all conditions as one batch."""
     return torch.cat(list(readings.values()))
 
 
 def run_all(study: Study) -> None:
-    """Trains and tests what is not done already; leaves rows in ``--out/rows``."""
+    """Trains and tests the missing filters; writes their rows to ``--out/rows``."""
     for seed in study.seeds:
         base, folder = Base(study, TrainedSensor(study, seed, study.sensor_budget)), study.out / "rows"
         once(folder / f"baselines-{base.name}.json", partial(_baselines, base, {"seed": seed}))
@@ -185,7 +185,7 @@ def _filter(base: Base, names: dict) -> list[dict]:
 
 
 def diagnosis(sensor: TrainedSensor) -> str:
-    """Returns how slowly a sensor's errors change, on episodes that train and choose filters: none is tested on."""
+    """Returns the correlation of a sensor's errors in time, on tuning and validation episodes."""
     errors = []
     for role in ("tune", "validation"):
         readings = read_all(sensor.trained[0], sensor.codes(role), 64)

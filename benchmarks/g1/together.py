@@ -1,6 +1,6 @@
-"""Camera, encoders and commands of the arm together, each with errors that last: ``python -m benchmarks.g1.together``.
+"""Fuses camera, encoders and commands of the arm, with coloured noise: ``python -m benchmarks.g1.together``.
 
-All filters run on what one camera sensor reads. Their motion is learned from true states, all else is taken from
+All filters read the same camera sensor. Their motion is learned from true states, all noise is estimated from
 residuals: no filter is trained.
 """
 
@@ -31,18 +31,18 @@ from torch_denkf.imperfect import FadingBias
 from torch_denkf.modules import ConstantNoise, LearnedTransition, MappedNoise, MomentPrior, Select
 from torch_denkf.training import hold_last
 
-RATE = 30  # rows a second
+RATE = 30  # rows per second
 ENCODER = math.radians(0.1)  # standard deviation of an encoder's reading, rad
-COMMANDS = 8  # of the last rows, that the joints follow
-SURPRISE = 2.0  # factor on what the motion missed in training: of 1, 1.5, 2 and 3, on the validation episodes
+COMMANDS = 8  # number of last commands in the regression of the joints
+SURPRISE = 2.0  # factor on the motion's residuals, chosen from 1, 1.5, 2 and 3 on the validation episodes
 LEVEL = 1.645  # standard deviations of a 90 % interval
-SEEN, AFTER = 30, (30, 90, 300)  # rows that are read before the camera is off; rows without it
+SEEN, AFTER = 30, (30, 90, 300)  # rows with the camera; rows after it is off
 Estimate = tuple[Tensor, Tensor | None]  # means and standard deviations of the joints, [N, T, 7]
 
 
 @dataclass(frozen=True)
 class Together(Recordings):
-    """Camera, encoders and commands of the arm together."""
+    """Fuses camera, encoders and commands of the arm."""
 
     seed: int = 0
     page: Path | None = None  # file of the tables
@@ -51,19 +51,19 @@ class Together(Recordings):
 
 
 class Arm:
-    """Holds what a camera reads of the arm, its motion, and how the sensors err.
+    """The arm's readings, motion and error models.
 
     Args:
-        study: where the recordings are.
+        study: options with the recordings.
     """
 
     def __init__(self, study: Together):
         self.study, self.sensor = study, TrainedSensor(study, study.seed, study.sensor_budget)
-        self.known = self.sensor.sequences()  # of the episodes that are not tested on
+        self.known = self.sensor.sequences()  # of the training and tuning episodes
         self.begin = torch.stack([state[0] for state, _ in self.known])
 
     def readings(self, role: str) -> TensorDict:
-        """Camera, encoders that are read once a second, and commands of a role's episodes ``[N, T]``."""
+        """Returns readings of a role's episodes ``[N, T]``: camera, encoders once a second, and commands."""
         read = read_all(self.sensor.trained[0], self.sensor.codes(role), 64)
         out, state = read.select("valid", "arrived", "observed", "state"), read["state"]
         out["camera"], out["camera_observed"] = read["sensor", "ensemble"][..., :JOINTS].mean(-2), read["observed"]
@@ -75,13 +75,13 @@ class Arm:
 
     @cached_property
     def follow(self) -> Tensor:
-        """Least squares of the joints on the last commands, ``[8 * 7 + 1, 7]``."""
+        """Returns the least-squares weights of the joints on the last commands, ``[8 * 7 + 1, 7]``."""
         inputs, states = torch.cat([lagged(command) for _, command in self.known]), [state for state, _ in self.known]
         return torch.linalg.lstsq(inputs.double(), torch.cat(states).double()).solution.float()
 
     @cached_property
     def motion(self) -> Motion:
-        """The motion, learned from true states."""
+        """Returns the motion, learned from true states."""
         torch.manual_seed(self.study.seed)
         motion, paths = Motion(self.sensor.trained[1]), [with_rates(state, 1) for state, _ in self.known]
         settings = {"seed": self.study.seed, "updates": self.study.motion_updates}
@@ -89,7 +89,7 @@ class Arm:
 
     @cached_property
     def noise(self) -> MappedNoise:
-        """Returns the noise of the motion in a row: of the rates, and through them of the joints."""
+        """Returns the process noise per row: of the rates, and through them of the joints."""
         motion, pairs = self.motion, [with_rates(state, 1) for state, _ in self.known]
         with torch.no_grad():
             missed = torch.cat([one[1:, JOINTS:] - motion(one[:-1])[:, JOINTS:] for one in pairs])
@@ -98,7 +98,7 @@ class Arm:
         return MappedNoise(unit, torch.cat([root, root]))
 
     def start(self, begins: bool = True) -> MomentPrior:
-        """Returns where episodes begin, or where the arm is at any time; at rest, or nearly."""
+        """Returns the prior at the beginning of an episode, with small rates, or at any time."""
         poses = self.begin if begins else torch.cat([state for state, _ in self.known])
         rate = self.motion.rate.square().diag() * (0.1 if begins else 1.0)
         mean = torch.cat([poses.mean(0), torch.zeros(JOINTS)])
@@ -106,11 +106,11 @@ class Arm:
 
     @cached_property
     def unseen(self) -> list[TensorDict]:
-        """Readings of the episodes that are not tested on, and that the camera's sensor has not seen."""
+        """Returns readings of the tuning and validation episodes, which the camera's sensor was not trained on."""
         return [self.readings(role) for role in ("tune", "validation")]
 
     def errors(self, name: str, kind: str) -> tuple[FadingBias | None, Tensor]:
-        """Estimates a sensor's bias, ``"episodes"`` for a part that is an episode's, and its white noise."""
+        """Estimates a sensor's bias and its white noise; ``"episodes"`` adds a bias that is constant in an episode."""
         errors = [torch.where(one[f"{name}_observed"], one[name] - one["state"], torch.nan) for one in self.unseen]
         every = pad_sequence([error for one in errors for error in one], batch_first=True, padding_value=torch.nan)
         if kind == "white":
@@ -118,7 +118,7 @@ class Arm:
         return FadingBias.from_residuals(every, per_run=kind == "episodes", trainable=False)
 
     def run(self, *names: str, data: TensorDict, begins: bool = True, kind: str = "episodes") -> Estimate:
-        """Estimates by a filter of some sensors; for the kind see :meth:`errors`. Encoders have no bias."""
+        """Runs a filter of some sensors; for the kind see :meth:`errors`. Encoders have no bias."""
         sensors, read = {}, Select(list(range(JOINTS)))
         for name in names:
             error, noise = (None, [ENCODER] * JOINTS) if name == "encoder" else self.errors(name, kind)
@@ -130,11 +130,14 @@ class Arm:
         return belief["mean"][..., :JOINTS], belief["var"][..., :JOINTS].sqrt()
 
     def held(self, data: TensorDict, name: str) -> Tensor:
-        """A sensor's last reading."""
+        """Returns a sensor's last reading at each row."""
         return hold_last(data[name], data[f"{name}_observed"], self.begin.mean(0).expand_as(data[name][:, 0]))
 
     def combined(self, data: TensorDict) -> Tensor:
-        """Least squares of each joint on camera, encoder, and the camera when that was read, from other episodes."""
+        """Returns the best linear combination of camera, encoder, and the camera at the encoder's time, by joint.
+
+        Its weights are least squares on other episodes.
+        """
 
         def both(one: TensorDict) -> Tensor:
             camera, encoder = (self.held(one, name) for name in ("camera", "encoder"))
@@ -148,14 +151,14 @@ class Arm:
 
 
 def lagged(commands: Tensor) -> Tensor:
-    """Commands ``[T, 7]`` of the last rows side by side, and a one, ``[T, 57]``."""
+    """Concatenates the last 8 commands of ``[T, 7]`` and a one to ``[T, 57]``."""
     rows = torch.arange(len(commands))
     parts = [commands[(rows - lag).clamp_min(0)] for lag in range(COMMANDS)]
     return torch.cat([*parts, torch.ones(len(commands), 1)], -1)
 
 
 def score(estimate: Estimate, data: TensorDict, at: Tensor) -> list[str]:
-    """Mean absolute error in degrees, and what the 90 % intervals hold, at rows ``[N, T]``."""
+    """Returns the mean absolute error in degrees, and the coverage of the 90 % intervals, at rows ``[N, T]``."""
     mean, std = estimate
     error = (mean - data["state"])[at].abs()
     held = "" if std is None else f"{100 * (error < LEVEL * std[at]).float().mean():.0f} %"
@@ -163,7 +166,7 @@ def score(estimate: Estimate, data: TensorDict, at: Tensor) -> list[str]:
 
 
 def read_together(arm: Arm) -> list[str]:
-    """The table of what is read, and how well the arm is known from it."""
+    """Returns the table of errors and coverages for each set of sensors."""
     data = arm.readings("test")
     at, dark = data["valid"].squeeze(-1).clone(), data.copy()
     at[:, 0] = False
@@ -192,7 +195,7 @@ def read_together(arm: Arm) -> list[str]:
 
 
 def camera_off(arm: Arm) -> list[str]:
-    """The table of a camera that is off."""
+    """Returns the table of errors after the camera is off."""
     data, rows = arm.readings("test"), SEEN + max(AFTER) + 1
     generator, parts = torch.Generator().manual_seed(5), []
     lengths = data["valid"].sum((1, 2)).tolist()

@@ -1,1 +1,1 @@
-"""Filters on a GPU: what a step costs at each batch size, and what a simulator's step leaves for it."""
+"""Times filters on a GPU at each batch size."""

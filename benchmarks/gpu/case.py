@@ -1,4 +1,4 @@
-"""One measurement: what is called, in which way, and what it gave."""
+"""One measurement: the call to time, the way to run it, and its result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-#: Ways to run a filter, and what ``Filter.compile`` is given for each.
+#: Ways to run a filter, and the options of ``Filter.compile`` for each.
 WAYS: dict[str, dict[str, Any]] = {
     "eager": {"chunk": 0},
     "graph": {"mode": "graph"},
@@ -21,13 +21,13 @@ WAYS: dict[str, dict[str, Any]] = {
 
 @dataclass
 class Case:
-    """A call to time, made when its turn comes.
+    """A call to time, which is made just before it is timed.
 
     Attributes:
         name: of the table's row.
         make: returns the call; takes no arguments.
         way: eager, graph, compiled, or a peer's name.
-        batch: filters side by side.
+        batch: filters in a batch.
         steps: in one call.
         gradients: whether the call differentiates, too.
         dims: of the state.
@@ -44,7 +44,7 @@ class Case:
 
 @dataclass
 class Found:
-    """A row of the result; ``ms`` is ``None`` where ``note`` says why."""
+    """A row of the result; if ``ms`` is ``None``, ``note`` has the reason."""
 
     part: str
     name: str
@@ -60,23 +60,23 @@ class Found:
 
     @property
     def rate(self) -> float | None:
-        """Steps of one filter in a second."""
+        """Returns steps of one filter in a second."""
         return None if self.ms is None else 1e3 * self.batch * self.steps / self.ms
 
     def as_dict(self) -> dict[str, Any]:
-        """Fields, and the rate."""
+        """Returns the fields, and the rate."""
         return {**asdict(self), "steps_per_s": self.rate}
 
 
 def wait(device: str) -> None:
-    """Waits for what was launched."""
+    """Waits for launched kernels."""
     if device == "cuda":
         torch.cuda.synchronize()
 
 
 @contextmanager
 def only_this(device: str) -> Iterator[None]:
-    """Leaves no memory of a case to the next one."""
+    """Frees a case's memory before the next one."""
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""Filters and data of the study, of any state's dimension."""
+"""Filters and data of the study, for any dimension of the state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HIDDEN, MEMBERS, READING = (32, 32, 64, 64), 32, "reading"
 def networks(
     dims: int, layer: str, key: str = READING
 ) -> tuple[LearnedTransition, None, LearnedObservation, ConstantNoise]:
-    """Transition, observation and noise of a filter; half of the state is observed."""
+    """Returns transition, observation and noise of a filter; half of the state is observed."""
     torch.manual_seed(0)
     observed = max(2, dims // 2)
     motion = LearnedTransition(StochasticMLP(dims, dims, HIDDEN, layer=layer, output_gain=0.3))
@@ -76,7 +76,7 @@ MODELS = {
 
 
 def frames(dims: int, batch: int, steps: int, device: str) -> TensorDict:
-    """Readings ``[batch, steps, O]``."""
+    """Returns readings ``[batch, steps, O]``."""
     generator = torch.Generator().manual_seed(1)
     reading = torch.randn(batch, steps, max(2, dims // 2), generator=generator)
     return TensorDict({READING: reading}, [batch, steps]).to(device)
@@ -91,7 +91,7 @@ LEG = """<body pos="{x} {y} 0"><joint name="{n}_a" axis="1 0 0"/><geom type="sph
 <body pos="0 0 -.2"><joint name="{n}_c" axis="0 1 0"/>
 <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".015" mass=".2"/>
 <site name="{n}" pos="0 0 -.2"/></body></body></body>"""
-#: Where the legs are, and how far out the knees.
+#: Position of each leg, and sideways offset of its knee.
 CORNERS = {
     "front_left": (0.19, 0.05, 0.08),
     "front_right": (0.19, -0.05, -0.08),
@@ -101,7 +101,7 @@ CORNERS = {
 
 
 def robot_filter(kind: str, members: int = 64) -> Filter:
-    """A legged robot's filter; MuJoCo reads its file, and no simulator of MuJoCo's runs."""
+    """Returns a legged robot's filter; MuJoCo only reads the model, without simulation."""
     import mujoco
 
     from torch_denkf.applications.legged import legged_filter
@@ -112,7 +112,7 @@ def robot_filter(kind: str, members: int = 64) -> Filter:
 
 
 def robot_readings(batch: int, device: str) -> TensorDict:
-    """Readings of robots that stand, with noise."""
+    """Returns readings of robots that stand, with noise."""
     generator = torch.Generator().manual_seed(2)
 
     def noisy(mean: list[float], std: float) -> torch.Tensor:

@@ -15,7 +15,7 @@ from torch_denkf.filters import Filter
 
 
 def sequence(filter: Filter, data: TensorDict, gradients: bool) -> Callable[[], object]:
-    """A whole sequence; with the gradients of a loss of its means."""
+    """Returns a call that runs a whole sequence, optionally with the gradients of a loss of its means."""
     parameters = [value for value in filter.parameters() if value.requires_grad]
     if gradients and not parameters:
         data = data.apply(lambda value: value.requires_grad_())
@@ -32,7 +32,7 @@ def sequence(filter: Filter, data: TensorDict, gradients: bool) -> Callable[[], 
 
 
 def loop(step: Callable[[TensorDict], object], row: TensorDict) -> Callable[[], object]:
-    """One step, without gradients."""
+    """Returns a call that runs one step, without gradients."""
 
     def call() -> object:
         with torch.no_grad():
@@ -42,7 +42,7 @@ def loop(step: Callable[[TensorDict], object], row: TensorDict) -> Callable[[], 
 
 
 def of_filters(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """Each kind of filter, dimension and batch size: a sequence, forward and with gradients."""
+    """Yields each kind of filter, dimension and batch size: a sequence, forward and with gradients."""
     steps = 2 if smoke else 20
     for batch in (2,) if smoke else (65536, 4096, 64, 1):
         for name, make in MODELS.items():
@@ -50,7 +50,7 @@ def of_filters(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case
                 if (batch in (1, 65536) and (dims, gradients) != (5, False)) or (batch == 64 and dims > 5):
                     continue
                 for way in ways:
-                    if way == "eager" and (batch == 1 or dims > 5):  # as long as 64 filters, and as those of 5
+                    if way == "eager" and (batch == 1 or dims > 5):  # same times as 64 filters, and as 5 dimensions
                         continue
 
                     def call(make=make, dims=dims, batch=batch, gradients=gradients, way=way):
@@ -61,7 +61,7 @@ def of_filters(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case
 
 
 def of_paper(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """The paper's networks (Table I, S = 5, O = 2, E = 32), as ``benchmarks.speed`` has them, beside cuthbert."""
+    """Yields cases of the paper's networks (Table I, S = 5, O = 2, E = 32) and of cuthbert."""
     steps = 2 if smoke else 20
     for batch in (2,) if smoke else (64, 4096):
         for way in ways:
@@ -82,7 +82,7 @@ def of_paper(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
 
 
 def of_peers(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """Other libraries on the same work, where they are installed: JAX compiles, torch-kf is eager torch."""
+    """Yields the same work in other libraries, if installed: JAX compiles, torch-kf is eager torch."""
     os.environ["JAX_PLATFORMS"] = "cuda" if device == "cuda" else "cpu"
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     for batch in (2,) if smoke else (64, 4096):
@@ -124,7 +124,7 @@ def of_peers(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
 
 
 def of_training(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """A training step of the KITTI preset on 64 sequences of 20 pictures, beside its trunk alone."""
+    """Yields a training step of the KITTI preset on 64 sequences of 20 images, and one of its trunk alone."""
     from benchmarks.speed import training_step as preset
 
     batch, steps = (2, 3) if smoke else (preset.BATCH, preset.STEPS)
@@ -144,7 +144,7 @@ def of_training(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Cas
 
 
 def of_robots(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """Legged robots side by side, as many as a simulator on the device has."""
+    """Yields a batch of legged robots, as large as in a simulator on the device."""
     for batch in (2,) if smoke else (4096,):
         for kind in ("EKF", "DEnKF"):
             for way in ways:
@@ -158,7 +158,7 @@ def of_robots(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]
 
 
 def of_environments(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """Torchrl's own ways: a filter in an environment, in a policy, captured and compiled by torchrl."""
+    """Yields filters in torchrl's environments and policies, captured and compiled by torchrl."""
     from tensordict.nn import CudaGraphModule, TensorDictModule, TensorDictSequential
     from torchrl.collectors import Collector
     from torchrl.envs import InitTracker, TransformedEnv
@@ -220,7 +220,7 @@ def of_environments(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator
 
 
 def of_analysis(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """An ensemble of many components, as weather has them, and 40 members."""
+    """Yields an ensemble with many components, as in weather forecasting, and 40 members."""
     from torch_denkf.functional import analyse
 
     size = 100 if smoke else 10**6
@@ -236,7 +236,7 @@ def of_analysis(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Cas
 
 
 def of_equality(device: str, ways: tuple[str, ...], smoke: bool) -> Iterator[Case]:
-    """Not times: a difference raises, and its row says so."""
+    """Yields checks instead of times: a difference raises, and the row's note has the error."""
 
     def eager_of(name: str, data: TensorDict):
         torch.manual_seed(0)

@@ -22,19 +22,19 @@ from benchmarks.gpu.parts import LIMITS, PARTS
 
 @dataclass
 class Gpu:
-    """Times filters on a GPU, part by part; what is finished is written at once."""
+    """Times filters on a GPU, part by part; each row is written at once."""
 
     out: Path | None = None  # folder for gpu.jsonl, gpu.json and gpu.md
-    parts: some_of(PARTS) = tuple(PARTS)  # type: ignore[valid-type]  # which parts, in this order
-    ways: some_of(WAYS) = ("eager", "graph")  # type: ignore[valid-type]  # "compiled": a minute a row
+    parts: some_of(PARTS) = tuple(PARTS)  # type: ignore[valid-type]  # parts to run, in this order
+    ways: some_of(WAYS) = ("eager", "graph")  # type: ignore[valid-type]  # "compiled": a minute per row
     device: Literal["cuda", "cpu"] = "cuda"
-    seconds: float = 0.3  # for which a case is timed
+    seconds: float = 0.3  # duration of a case
     limit: float = 360.0  # seconds in all
-    smoke: bool = False  # tiny, on a processor: does it run?
-    inside: bool = False  # this process runs the parts itself
+    smoke: bool = False  # a short check on a processor
+    inside: bool = False  # run the parts in this process
 
     def __call__(self) -> None:
-        """Measures and prints."""
+        """Runs the measurements, and prints the table."""
         if self.smoke:
             self.device, self.seconds, self.inside, self.limit = "cpu", 0.0, True, 600.0
         if self.device == "cuda" and not torch.cuda.is_available():
@@ -79,7 +79,7 @@ class Gpu:
         return rows
 
     def run_apart(self, part: str, left: float) -> list[dict[str, Any]]:
-        """Runs a part in a process of its own: an error of CUDA's ends that one alone."""
+        """Runs a part in a separate process, so that a CUDA error does not end the other parts."""
         if left < 5:
             print(f"{part}: not run, no time left", flush=True)
             return []
@@ -100,7 +100,7 @@ class Gpu:
 
 
 def about(device: str) -> dict[str, str]:
-    """The card, versions and the date."""
+    """Returns the card, versions and the date."""
     import tensordict
     import torchrl
 
@@ -110,9 +110,9 @@ def about(device: str) -> dict[str, str]:
 
 
 def page_of(rows: list[dict[str, Any]], about: dict[str, str], smoke: bool) -> str:
-    """The Markdown page."""
+    """Returns the Markdown page."""
     versions = ", ".join(f"{name} {value}" for name, value in about.items() if name not in ("device", "date"))
-    text = ["# On a GPU", "", f"{about['device']}; {versions}; {about['date']}. Medians, in ms a call."]
+    text = ["# On a GPU", "", f"{about['device']}; {versions}; {about['date']}. Medians, in ms per call."]
     for part in dict.fromkeys(row["part"] for row in rows):
         text += ["", f"## {part.capitalize()}", ""]
         text += head("what", "state", "batch", "steps", "gradients", "way", "ms", "steps/s", "first call, s", "note")

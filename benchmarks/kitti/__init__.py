@@ -1,1 +1,1 @@
-"""Visual odometry on KITTI, leaving one drive out after the other."""
+"""Visual odometry on KITTI, by leave-one-drive-out cross-validation."""

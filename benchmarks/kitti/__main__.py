@@ -18,7 +18,7 @@ from torch_denkf.deployment.files import write_text
 
 
 def smoke(study: Study) -> Study:
-    """Everything once, on four small drives that are rendered for it."""
+    """Returns a tiny study of everything, on four small rendered drives."""
     folder = Path(tempfile.mkdtemp(prefix="kitti-"))
     names = tuple(write_drives(folder / "kitti", ["a", "b", "c", "d"], frames=20, seed=0))
     budget = Budget(sensor=3, fine_tuning=2, filter=2, end_to_end=2, length=8)

@@ -1,4 +1,4 @@
-"""Errors of a trained filter on the drive that was left out, beside dead reckoning and its floor."""
+"""Errors of a trained filter on the drive that was left out, compared with dead reckoning and its floor."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from torch_denkf.metrics import interval_coverage, nees, spread_skill_ratio, sta
 from torch_denkf.training import hold_last
 
 MASKS = 8  # draws of the missing frames, over which the errors are averaged
-WINDOWS = (50, 100, 200, 400, 800)  # steps; 50 for drives that have no more, all of a shorter one
+WINDOWS = (50, 100, 200, 400, 800)  # steps; drives shorter than 50 steps have one window, the whole drive
 TIMED = 100  # steps to time a filter on
-DRAWS = 3  # runs of a filter that draws random numbers: its errors are means over them
+DRAWS = 3  # runs of a filter with random draws, over which its errors are averaged
 
 
 def last_velocities(reading: TensorDict, dt: float) -> Tensor:
-    """The sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the true ones.
+    """Returns the sensor's mean velocities ``[N, 2]`` with a zero-order hold, which starts from the true ones.
 
-    A pair over a gap gives the mean over its steps, unless it is farther apart than the sensor can read.
+    A pair over a gap gives the mean over its steps, unless its distance is beyond the sensor's reach.
     """
     steps = reading["steps"]
 
@@ -49,14 +49,14 @@ def last_velocities(reading: TensorDict, dt: float) -> Tensor:
 
 
 def integrate(velocity: Tensor, truth: Tensor, dt: float) -> Tensor:
-    """The states ``[N, 5]`` that velocities lead to from the true first pose."""
+    """Integrates velocities to states ``[N, 5]`` from the true first pose."""
     return torch.cat([dead_reckoning(velocity.double(), truth[0, :3].double(), dt), velocity.double()], -1)
 
 
 def evaluate(
     recipe: KITTIRecipe, model: Filter, stream: Stream, cache: Path, *, filter_name: str, kind: str, seed: int
 ) -> tuple[list[dict], dict[str, TensorDict]]:
-    """All rows of the table for one drive, and its beliefs by condition, for the plots."""
+    """Returns all rows of the table for one drive, and its beliefs by condition, for the plots."""
     clean = read_spans(model["sensor"], Part(stream), cache, kind)
     pairs = [("clean", all_frames(clean))]
     for condition in DISTURBANCES:
@@ -81,7 +81,7 @@ def evaluate(
             states = belief["belief", "mean"][:, :5].double()
             add(filter_name, condition, reading, states, {**calibration(belief), **costs})
         if "ensemble" not in out["belief"]:
-            break  # the same each time
+            break  # deterministic
     for condition, reading in pairs:
         add("dead_reckoning", condition, reading, integrate(last_velocities(reading, dt), truth, dt), {})
     add("floor", "clean", pairs[0][1], integrate(truth[:, VELOCITIES], truth, dt), {})
@@ -94,7 +94,7 @@ def evaluate(
 
 
 def _mean(rows: list[dict]) -> dict:
-    """One row of several that differ in their numbers alone: which frames are missing is chance, as are draws."""
+    """Returns the mean of rows that differ only by the random draw of missing frames and noise."""
     mean = {
         key: fmean(row[key] for row in rows) if isinstance(value, float) else value for key, value in rows[0].items()
     }
@@ -102,14 +102,14 @@ def _mean(rows: list[dict]) -> dict:
 
 
 def errors(states: Tensor, truth: Tensor) -> list[dict]:
-    """Errors of a path by window; those that know no window stand in each row."""
+    """Returns errors of a path by window; errors without a window are repeated in each row."""
     velocity = state_errors(states[1:, VELOCITIES], truth[1:, VELOCITIES])
     whole = {
         "rmse_v_m_per_s": float(velocity.rmse[0]),
         "mae_v_m_per_s": float(velocity.mae[0]),
         "rmse_theta_dot_deg_per_s": float(velocity.rmse[1].rad2deg()),
         "mae_theta_dot_deg_per_s": float(velocity.mae[1].rad2deg()),
-        # Of a point; a belief's replace them.
+        # The CRPS of a point estimate; that of a belief replaces it.
         "crps_v_m_per_s": float(velocity.mae[0]),
         "crps_theta_dot_deg_per_s": float(velocity.mae[1].rad2deg()),
     }
@@ -136,7 +136,7 @@ def errors(states: Tensor, truth: Tensor) -> list[dict]:
 
 
 def calibration(belief: TensorDict) -> dict[str, float]:
-    """Tells how far the spread of (v, theta_dot) tells the error, over all rows but the first, which is given."""
+    """Returns the calibration of (v, theta_dot) over all rows but the first, which is given."""
     equal = "ensemble" in belief["belief"] and "log_weight" not in belief["belief"]
     members = belief["belief", "ensemble"].shape[1] if equal else None
     mean, variance, truth = (value.double() for value in counted(belief, VELOCITIES, FLOOR))

@@ -1,4 +1,4 @@
-"""Who trains, who tunes, who validates and who is tested; and batches of their frames."""
+"""Splits drives into training, tuning, validation and test, and draws batches of their frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch_denkf.applications.car.odometry.batches import PairSampler
 from torch_denkf.applications.car.odometry.streams import rows
 
 VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
-# Standard deviations of (v, theta_dot) over the training drives' that a good sensor leaves: units of the losses.
+# Errors of a good sensor in (v, theta_dot), in standard deviations over the training drives: units of the losses.
 UNITS = (0.1, 0.03)
 
 
@@ -22,7 +22,7 @@ UNITS = (0.1, 0.03)
 class Statistics:
     """Means and standard deviations of the training drives alone."""
 
-    loc: torch.Tensor  # of (v m/s, theta_dot rad/s); theta_dot's is 0, because every drive counts mirrored, too
+    loc: torch.Tensor  # of (v m/s, theta_dot rad/s); 0 for theta_dot, because every drive is also used mirrored
     scale: torch.Tensor
     pixel_loc: torch.Tensor  # of a grey frame and of its difference to the one before
     pixel_scale: torch.Tensor
@@ -30,13 +30,13 @@ class Statistics:
 
     @property
     def unit(self) -> torch.Tensor:
-        """Returns what counts as an error of one, in (m/s, rad/s)."""
+        """Returns the units of the errors, in (m/s, rad/s)."""
         return self.scale * torch.tensor(UNITS)
 
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of a stream, with the share of the batches that it gets."""
+    """A part of a stream, with its weight in the batches."""
 
     stream: Stream
     begin: float = 0.0  # shares of its rows
@@ -45,21 +45,21 @@ class Part:
 
     @property
     def steps(self) -> int:
-        """Between the two frames of a pair."""
+        """Returns the steps between the two frames of a pair."""
         return self.stream.steps
 
     def read(self, cache: Path) -> TensorDict:
-        """The stretch, ``[n]``."""
+        """Returns the rows of the part, ``[n]``."""
         data = self.stream.read(cache)
         return data[int(self.begin * len(data)) : int(self.end * len(data))]
 
 
 @dataclass(frozen=True)
 class Fold:
-    """One drive is left out for the test; it may not be in the other lists.
+    """Split of the drives with one test drive, which may not be in the other lists.
 
-    The filter is tuned on drives that its sensor has not seen, so that it learns how wrong the sensor is on new ones;
-    see ``SensorTraining.unseen_readings`` for drives that are in both lists.
+    The filter is tuned on drives that its sensor was not trained on, so that it learns the sensor's errors on new
+    drives; see ``SensorTraining.unseen_readings`` for drives that are in both lists.
     """
 
     name: str
@@ -72,21 +72,21 @@ class Fold:
         tested = {stream.drive for stream in self.test}
         leaked = {part.stream.drive for part in (*self.train, *self.tune, *self.validation)} & tested
         if leaked:
-            raise ValueError(f"fold {self.name}: {sorted(leaked)} would be trained and tested on")
+            raise ValueError(f"fold {self.name}: {sorted(leaked)} are in both training and test")
 
     @property
     def trained(self) -> set[str]:
-        """Drives that the sensor sees."""
+        """Returns the drives that train the sensor."""
         return {part.stream.drive for part in self.train}
 
     @property
     def shared(self) -> set[str]:
-        """Drives for both sensor and filter."""
+        """Returns drives for both sensor and filter."""
         return self.trained & {part.stream.drive for part in self.tune}
 
 
 def with_disturbances(parts: Sequence[Part]) -> list[Part]:
-    """Each part clean, and with half as much weight again in all disturbances together."""
+    """Returns each part clean, and disturbed with half of its weight over all disturbances."""
     disturbed = []
     for part in parts:
         disturbed.append(part)
@@ -97,7 +97,7 @@ def with_disturbances(parts: Sequence[Part]) -> list[Part]:
 
 
 def with_spans(parts: Sequence[Part]) -> list[Part]:
-    """Each clean part, and with less weight in pairs of two and of three steps."""
+    """Returns each clean part, and with less weight in pairs of two and of three steps."""
     longer = [
         replace(part, stream=replace(part.stream, steps=steps), weight=weight * part.weight)
         for part in parts
@@ -108,10 +108,10 @@ def with_spans(parts: Sequence[Part]) -> list[Part]:
 
 
 def make_fold(test: str, streams: Sequence[Stream], train: Sequence[Part], held_out: Sequence[Part]) -> Fold:
-    """The fold that leaves ``test`` out.
+    """Returns the fold with ``test`` left out.
 
-    All others train both sensor and filter, see ``SensorTraining.unseen_readings``; rendered drives validate, or,
-    without them, the drive that follows the test drive.
+    The other drives train both sensor and filter, see ``SensorTraining.unseen_readings``. Validation uses rendered
+    drives or, without them, the drive that follows the test drive.
     """
     drives = list(dict.fromkeys(stream.drive for stream in streams))
     of = {drive: [stream for stream in streams if stream.drive == drive] for drive in drives}
@@ -139,7 +139,7 @@ def _rows(stream: Stream) -> int:
 
 
 def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
-    """Means and standard deviations over clean training drives, each counted mirrored, too."""
+    """Returns means and standard deviations over clean training drives and their mirror images."""
     data = [part.read(cache) for part in parts if part.stream.condition == "clean" and part.stream.steps == 1]
     velocity = torch.cat([part["state"][:, VELOCITIES] for part in data])
     loc, scale = velocity.mean(0), velocity.std(0)
@@ -149,11 +149,11 @@ def statistics(parts: Sequence[Part], cache: Path) -> Statistics:
     frames = torch.cat(frames)
     dt = torch.stack([part["dt"][0, 0] for part in data])
     if (dt / dt[0] - 1).abs().max() > 0.01:
-        raise ValueError(f"the drives have frame times of {dt.unique().tolist()} s; a study needs the same")
+        raise ValueError(f"the drives have frame times of {dt.unique().tolist()} s; a study needs equal ones")
     return Statistics(loc, scale, frames.mean((0, 2, 3)), frames.std((0, 2, 3)), float(dt[0]))
 
 
 def frame_sampler(parts: Sequence[Part], cache: Path, sensor: str) -> PairSampler:
-    """Draws single frames, or windows, from the streams themselves: for training that involves the sensor."""
+    """Returns a sampler of single frames, or windows, from the streams, for training that involves the sensor."""
     parts = [part for part in parts if part.steps == 1 or sensor == "flow"]
     return PairSampler(parts, [read_by(sensor, part.read(cache)) for part in parts], LONGEST)

@@ -1,4 +1,4 @@
-"""Pictures of one drive: path, velocities, errors by length, spread against error."""
+"""Plots of one drive: path, velocities, errors by length, spread against error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHOWN = {"dims": VELOCITIES, "names": ["v, m/s", "theta_dot, deg/s"], "factors":
 
 
 def draw_drive(belief: TensorDict, rows: Sequence[dict], title: str, dt: float, file: Path) -> None:
-    """Draws what a filter believed on one drive in one condition.
+    """Draws a filter's belief on one drive in one condition.
 
     Args:
         belief: the filter's sequence ``[N]``.

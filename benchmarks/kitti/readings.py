@@ -1,4 +1,4 @@
-"""A frozen sensor's readings of whole streams."""
+"""Runs a frozen sensor on whole streams."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from torch_denkf.modules import SubModel
 
 
 def read_sensor(sensor: SubModel, data: TensorDict, kind: str) -> TensorDict:
-    """A sensor's readings of a whole stream ``[N]``, from the same random numbers each time."""
+    """Returns a sensor's readings of a whole stream ``[N]``, with a fixed seed."""
     return streams.read_sensor(sensor, read_by(kind, data), LONGEST).exclude("pixels")
 
 
 def read_spans(sensor: SubModel, part: Part, cache: Path, kind: str, mirrored: bool = False) -> TensorDict:
-    """A sensor's readings of a part ``[N]``, of pairs of 1, 2, ... steps: ``("spans", ...)`` ``[N, LONGEST]``.
+    """Returns a sensor's readings of a part ``[N]`` for frame pairs 1, 2, ... steps apart.
 
-    Those that were not computed are not observed.
+    They are ``("spans", ...)`` ``[N, LONGEST]``. The observed mask is False for pairs that were not computed.
     """
     parts = [replace(part, stream=stream) for stream in spans(part.stream, kind)]
     data = [read_by(kind, each.read(cache)) for each in parts]

@@ -1,4 +1,4 @@
-"""Sensors by name, and their training: alone, and as stand-ins that have not seen what they read."""
+"""Sensors by name, and their training: alone, and by cross-fitting."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ SAMPLES = 32  # of a sensor: as many as the ensemble filters have members
 
 
 def flow_sensor(statistics: Statistics) -> SubModel:
-    """Optical flow, road correlation, and the turn by tracked corners."""
+    """Returns the sensor of optical flow, road correlation, and tracked corners for the turn."""
     return FlowSensor(dt=statistics.dt, ensemble_size=SAMPLES, two_view_key="two_view")
 
 
 def image_sensor(statistics: Statistics) -> SubModel:
-    """The paper's: Table I on a grey frame and its difference to the one before."""
+    """Returns the paper's sensor: Table I on a grey frame and its difference to the one before."""
     return ImageSensor(
         2,
         image_shape=(2, 50, 150),
@@ -47,14 +47,14 @@ SENSORS: dict[str, Callable[[Statistics], SubModel]] = {"flow": flow_sensor, "im
 
 
 def sensor_loss(sensor: SubModel, unit: Tensor) -> SensorLoss:
-    """CRPS of v and of theta_dot, in units of a good sensor's errors."""
+    """Returns the CRPS of v and of theta_dot, in units of a good sensor's errors."""
     terms = {"loss_v": slice(0, 1), "loss_theta_dot": slice(1, 2)}
     return SensorLoss(sensor, lambda frames: frames["target_observation"], unit, terms)
 
 
 @dataclass(frozen=True)
 class SensorTraining:
-    """Tells how the sensors of a study are trained: alone, and as stand-ins.
+    """Training of a study's sensors: alone, and by cross-fitting.
 
     Args:
         kind: name of the sensor.
@@ -69,7 +69,7 @@ class SensorTraining:
     seed: int
 
     def error(self, sensor: SubModel, parts: Sequence[Part]) -> dict[str, float]:
-        """CRPS of a sensor where it observes, mean of v and theta_dot in units of a good sensor's errors."""
+        """Returns the CRPS over observed rows, mean of v and theta_dot in units of a good sensor's errors."""
         scores = []
         for part in parts:
             read = read_sensor(sensor, part.read(self.cache), self.kind)
@@ -80,7 +80,7 @@ class SensorTraining:
     def train(
         self, sensor: SubModel, parts: Sequence[Part], held_out: Sequence[Part], out: Path, updates: int, **settings
     ) -> SubModel:
-        """Trains a sensor alone, or reads it where that was done before; settings are ``lr`` and ``keep``."""
+        """Trains a sensor alone, or loads it if it was trained before; settings are ``lr`` and ``keep``."""
         sampler, loss = frame_sampler(parts, self.cache, self.kind), sensor_loss(sensor, self.facts.unit)
         rates = {"lr": settings.pop("lr", 2e-3), "weight_decay": 0.02}
         return train_part(
@@ -97,11 +97,10 @@ class SensorTraining:
     def unseen_readings(
         self, sensor: SubModel, fold: Fold, out: Path, updates: int, lr: float
     ) -> list[tuple[TensorDict, TensorDict, float]]:
-        """Readings of drives by sensors that have not seen them, also where drives are too few to set some aside.
+        """Returns readings of drives by sensors that were not trained on them (cross-fitting).
 
         A filter learns from its sensor's errors, which are smaller on drives that the sensor was trained on. So drives
-        that are in both lists are read by one of two sensors that stand in: each is trained on one half of those
-        drives, and reads the other.
+        in both lists are read by two further sensors: each is trained on one half of those drives, and reads the other.
 
         Returns:
             for each part of the tuning drives, and mirrored: readings to tune with, readings to validate with, the
@@ -127,7 +126,7 @@ class SensorTraining:
 
 @dataclass
 class SensorOfFold:
-    """Holds what all filters of a fold share: the trained sensor and its readings of drives that it has not seen."""
+    """The trained sensor of a fold, which its filters share, and its readings of drives that it was not trained on."""
 
     kind: str
     sensor: SubModel
@@ -136,7 +135,7 @@ class SensorOfFold:
 
     @property
     def validation(self) -> list[TensorDict]:
-        """Readings to choose by; not the mirrored ones: they say the same."""
+        """Returns the readings for validation, without the mirrored ones, which are redundant."""
         return [reading for _, reading, _ in self.readings[::2]]
 
 
@@ -151,17 +150,17 @@ def sensor_of_fold(
     fine_tuning: int,
     pretrained: SubModel | None = None,
 ) -> SensorOfFold:
-    """Trains a fold's sensor, or reads it where that was done before.
+    """Trains a fold's sensor, or loads it if it was trained before.
 
     Args:
-        fold: who trains, tunes, validates.
+        fold: drives for training, tuning and validation.
         kind: name of the sensor.
-        out: checkpoints and logs.
+        out: folder for checkpoints and logs.
         cache: of the streams.
         seed: of all random numbers.
-        updates: of a sensor that starts anew.
-        fine_tuning: updates of one that is ``pretrained``, and of the stand-ins that read shared drives.
-        pretrained: where to start.
+        updates: of a sensor without pretraining.
+        fine_tuning: updates of a ``pretrained`` sensor, and of the further sensors that read shared drives.
+        pretrained: sensor whose parameters the training starts from.
     """
     torch.manual_seed(seed)
     facts = statistics(fold.train, cache)
@@ -170,7 +169,7 @@ def sensor_of_fold(
     if pretrained is not None:
         sensor.load_state_dict(pretrained.state_dict())
         settings, lr, updates = {"lr": 1e-3, "keep": "last"}, 1e-3, fine_tuning
-    # Stand-ins begin where the sensor does, so they are trained before it.
+    # The further sensors start from the same parameters, so they are trained before the sensor.
     read = training.unseen_readings(sensor, fold, out, updates, lr) if fold.shared else []
     training.train(sensor, fold.train, fold.validation, out / "sensor", updates, **settings)
     return SensorOfFold(kind, sensor, facts, read or training.unseen_readings(sensor, fold, out, 0, lr))

@@ -1,4 +1,4 @@
-"""Drives as the study reads them: one stream for each drive, camera and condition, computed once and kept on disk."""
+"""Streams of the study, one for each drive, camera and condition, computed once and cached on disk."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from torch_denkf.applications.car.kitti.frames import MOTION_KEYS
 from torch_denkf.data.cache import cached
 from torch_denkf.envs import BlackFrames, Blur, Brightness, OccludingBox, SaltAndPepper
 
-SMALL = (50, 150)  # rows and columns of what the image sensor reads: the paper's
-LONGEST = 3  # steps between two frames that the flow sensor may compare, where those between them are missing
+SMALL = (50, 150)  # rows and columns of the image sensor's input, as in the paper
+LONGEST = 3  # largest number of steps between two frames that the flow sensor compares over a gap
 MISSING = 0.3  # share of frames that do not arrive, and of black ones, as in the paper
 
-#: What happens to every image of a drive. "missing" needs no images of its own: it is a mask.
+#: Disturbances of every image of a drive. "missing" is a mask, and needs no other images.
 DISTURBANCES = {
     "salt_and_pepper": lambda generator: SaltAndPepper(in_keys=["image"], generator=generator),
     "blur": lambda generator: Blur(in_keys=["image"], generator=generator),
@@ -43,26 +43,26 @@ class Stream:
     camera: str
     condition: str = "clean"
     size: tuple[int, int] = (125, 414)  # of the images from which the flow is computed
-    pitch: float = 0.0  # rad: the camera is taken to be turned so far up, which makes the sensor find out
+    pitch: float = 0.0  # rad, error of the camera's assumed pitch, which the sensor must estimate
     steps: int = 1  # between the two frames of a pair
 
     @property
     def name(self) -> str:
-        """Drive and camera."""
+        """Returns drive and camera."""
         return f"{self.drive}/{self.camera}"
 
     def seed(self) -> int:
-        """Random numbers of the condition: its own, the same each time; not changed by what is made of the images."""
+        """Returns the seed of the condition, the same in each run."""
         what = (self.drive, self.camera, self.condition, self.size, self.pitch, self.steps)
         return int.from_bytes(hashlib.blake2b(repr(what).encode(), digest_size=4).digest(), "big")
 
     def read(self, cache: Path) -> TensorDict:
-        """Flow, road, small grey images and the truth, ``[N]``; memory-mapped."""
+        """Returns flow, road, small grey images and the truth, ``[N]``; memory-mapped."""
         name = f"{self.drive}-{self.camera}-{self.condition}-{self.seed():08x}"
         return cached(cache / name, self._compute)
 
     def _drive(self) -> TensorDict:
-        """Images as they come, whole."""
+        """Returns the drive's images at full size, disturbed by the condition."""
         torch.set_num_threads(1)
         cv2.setNumThreads(1)
         drive = read_kitti_drive(self.root, self.drive, camera=self.camera, size=self.size, colour=False, cache=None)
@@ -75,7 +75,7 @@ class Stream:
         return drive
 
     def _compute(self) -> TensorDict:
-        """Flow, road and corners of the drive, and its images, small."""
+        """Returns flow, road and corners of the drive, and its images at small size."""
         drive = self._drive()
         valid = drive["frame_valid"]
         paired = valid & torch.cat([torch.zeros_like(valid[: self.steps]), valid[: -self.steps]])
@@ -85,7 +85,7 @@ class Stream:
 
 
 def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = None) -> list[Stream]:
-    """Every camera of every drive below ``root`` that has images and poses."""
+    """Returns every camera of every drive below ``root`` that has images and poses."""
     found = drives or list_kitti_drives(root)
     if not found:
         raise FileNotFoundError(f"no drive below {root} has both images and poses")
@@ -99,7 +99,7 @@ def find_streams(root: Path, size: tuple[int, int], drives: list[str] | None = N
 
 
 def prepare(streams: list[Stream], cache: Path, processes: int) -> None:
-    """Computes what is not on disk yet, drives side by side."""
+    """Computes the streams that are not on disk, drives in parallel."""
     cache.mkdir(parents=True, exist_ok=True)
     side_by_side([partial(_prepare, stream, cache) for stream in streams], processes, "flow of all drives")
 
@@ -109,11 +109,11 @@ def _prepare(stream: Stream, cache: Path) -> None:
 
 
 def spans(stream: Stream, sensor: str) -> list[Stream]:
-    """The same drive in pairs of 1, 2, ... steps: what a sensor may read where frames are missing."""
+    """Returns the same drive in pairs of 1, 2, ... steps, which a sensor reads over missing frames."""
     longest = LONGEST if sensor == "flow" and stream.condition == "clean" else 1
     return [replace(stream, steps=steps) for steps in range(1, longest + 1)]
 
 
 def read_by(sensor: str, stream: TensorDict) -> TensorDict:
-    """A stream without what a sensor does not read."""
+    """Returns a stream without the entries that a sensor does not read."""
     return stream.exclude("image") if sensor == "flow" else stream.exclude(*MOTION_KEYS)

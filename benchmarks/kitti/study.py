@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -25,46 +25,46 @@ from torch_denkf.applications.car.kitti.render import render_drives
 from torch_denkf.modules import SubModel
 
 RENDERED_FRAMES = 160
-SHARED = ("dead_reckoning", "floor")  # rows that come with every filter
+SHARED = ("dead_reckoning", "floor")  # rows that each filter's job repeats
 
 
 @dataclass(frozen=True)
 class Study:
-    """Visual odometry on KITTI: the paper's protocol, with every filter that is registered.
+    """Evaluates visual odometry on KITTI by the paper's protocol, with every registered filter.
 
-    table: leave one drive out after the other, in all conditions. What was broken off goes on where it stopped. See
+    table: leave out one drive at a time, in all conditions. An interrupted run resumes. See
     benchmarks/kitti/README.md.
     """
 
     command: Positional[Literal["table"]] = "table"
     root: Path | None = None  # folder with sequences and poses
     out: Path = Path("runs/kitti")  # checkpoints, logs, table and plots
-    drives: tuple[str, ...] = ()  # drives of the study; all that are found
-    test: tuple[str, ...] = ()  # drives to leave out, one after the other; all
+    drives: tuple[str, ...] = ()  # drives of the study; by default all drives in the folder
+    test: tuple[str, ...] = ()  # drives to leave out, one at a time; by default all
     filters: some_of(sorted(FILTERS)) = ("denkf",)
     sensors: some_of(sorted(SENSORS)) = ("flow",)
     seeds: int = 1
     rendered: int = 0  # drives to render for a first training of the sensor
-    first: Path | None = None  # a table's --out, whose rendered drives and first training are taken; those of --out
+    first: Path | None = None  # --out of a table whose rendered drives and first training to use, instead of this --out
     size: tuple[int, int] = (125, 414)  # rows and columns to compute the flow at
-    processes: int = 1  # folds side by side
+    processes: int = 1  # folds in parallel
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
     smoke: bool = False  # a tiny run of everything, on rendered drives
 
     @property
     def cache(self) -> Path:
-        """Streams."""
+        """Returns the folder of the streams."""
         return self.out / "streams"
 
     @property
     def begun(self) -> Path:
-        """Tells where the rendered drives and the first training of the sensor are."""
+        """Returns the folder of the rendered drives and of the sensor's first training."""
         return self.first or self.out
 
     def rendered_parts(self) -> tuple[list[Part], list[Part]]:
-        """Rendered drives along invented paths, with traffic, to train the sensor on; and others that it does not see.
+        """Returns rendered drives along synthetic paths, with traffic, that train the sensor, and held-out ones.
 
-        Each is seen by a camera that is turned up or down a little, as another car's would be.
+        Each has a slightly different pitch of the camera, as in another car.
         """
         if not self.rendered:
             return [], []
@@ -81,7 +81,7 @@ class Study:
 
 
 def _settings(out: Path) -> dict:
-    """Options of a table that was made in a folder."""
+    """Returns the options of the table in a folder."""
     file = out / "settings.json"
     if not file.exists():
         raise FileNotFoundError(f"--first {out} has no settings.json; pass the --out of a table")
@@ -90,7 +90,7 @@ def _settings(out: Path) -> dict:
 
 @dataclass(frozen=True)
 class Job:
-    """The study's filters on one sensor on one fold from one seed: they share the sensor's weights and readings."""
+    """All filters of the study on one sensor, fold and seed, which share the sensor's weights and readings."""
 
     study: Study
     fold: Fold
@@ -99,11 +99,11 @@ class Job:
     rendered: tuple[list[Part], list[Part]] = ((), ())
 
     def out(self, name: str) -> Path:
-        """Checkpoints, logs and rows of one filter."""
+        """Returns the folder for checkpoints, logs and rows of one filter."""
         return self.study.out / "folds" / f"{self.fold.name}-{name}-{self.sensor}-{self.seed}"
 
     def base(self) -> SensorOfFold:
-        """The sensor, trained, and its readings."""
+        """Returns the trained sensor and its readings."""
         torch.set_num_threads(1)
         return sensor_of_fold(
             self.fold,
@@ -117,7 +117,7 @@ class Job:
         )
 
     def run(self) -> None:
-        """Trains, evaluates and draws what is not done already; leaves the rows in each filter's folder."""
+        """Trains, evaluates and draws the missing filters; writes the rows to each filter's folder."""
         base = None
         for name in self.study.filters:
             if (self.out(name) / "rows.json").exists():
@@ -126,7 +126,7 @@ class Job:
             once(self.out(name) / "rows.json", lambda name=name, base=base: self.test(name, base))
 
     def test(self, name: str, base: SensorOfFold) -> list[dict]:
-        """Rows of one filter, trained for it; and pictures, of the first seed."""
+        """Trains one filter and returns its rows; draws plots for seed 0."""
         loggers = ("csv", "tensorboard")
         settings = {"cache": self.study.cache, "seed": self.seed, "budget": self.study.budget, "loggers": loggers}
         trained = train_filter(self.fold, name, base, out=self.out(name), **settings)
@@ -135,7 +135,7 @@ class Job:
         return evaluate_and_draw(*trained, self.fold.test, self.study.cache, plots, **names)
 
     def pretrain(self) -> SubModel:
-        """The sensor that all folds of this seed begin with."""
+        """Returns the pre-trained sensor from which all folds of this seed start."""
         torch.set_num_threads(1)
         study, parts = self.study, with_spans(with_disturbances(self.rendered[0]))
         torch.manual_seed(self.seed)
@@ -145,12 +145,12 @@ class Job:
         return training.train(SENSORS[self.sensor](facts), parts, held_out, out, study.budget.sensor)
 
     def prepare_sensor(self) -> None:
-        """Does :meth:`pretrain` ahead of all folds, so that no two do it at once."""
+        """Runs :meth:`pretrain` before all folds, so that no two processes run it at once."""
         self.pretrain()
 
 
 def evaluate_and_draw(recipe, model, streams: Sequence[Stream], cache: Path, plots: Path | None, **names) -> list[dict]:
-    """Rows of some drives, and pictures of each, clean and with missing frames, in a folder if one is given."""
+    """Returns rows of some drives; draws each, clean and with missing frames, if a folder is given."""
     rows = []
     for stream in streams:
         own, beliefs = evaluate(recipe, model, stream, cache, **names)
@@ -165,7 +165,7 @@ def evaluate_and_draw(recipe, model, streams: Sequence[Stream], cache: Path, plo
 
 
 def make_jobs(study: Study) -> list[Job]:
-    """Every combination; seeds last, so that a study that is broken off has whole folds."""
+    """Returns every combination; seeds vary slowest, so that an interrupted study has all folds of a seed."""
     streams, rendered = find_streams(study.root, study.size, list(study.drives) or None), study.rendered_parts()
     names = study.test or list(dict.fromkeys(stream.drive for stream in streams))
     folds = [make_fold(name, streams, *rendered) for name in names]
@@ -188,7 +188,7 @@ def prepare_jobs(jobs: Sequence[Job], processes: int) -> None:
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> None:
-    """Computes all streams, pre-trains, then runs all folds side by side."""
+    """Computes all streams, pre-trains, then runs all folds in parallel."""
     prepare_jobs(jobs, processes)
     first = {(job.sensor, job.seed): job for job in jobs if job.rendered[0]}
     side_by_side([job.prepare_sensor for job in first.values()], processes, "training on rendered drives")
@@ -196,9 +196,9 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> None:
 
 
 def rows_of(out: Path) -> list[dict]:
-    """All rows that a study's folder holds: filters, sensors and seeds may come from several calls.
+    """Returns all rows in a study's folder; filters, sensors and seeds may come from several calls.
 
-    Each filter's rows bring dead reckoning with its sensor and the floor; those of the first one are kept.
+    Each filter's rows include dead reckoning with its sensor and the floor; those of the first filter are kept.
     """
     files = (out / "folds").glob("*/rows.json")
     files = sorted(files, key=lambda file: ("-denkf-" not in file.parent.name, file))

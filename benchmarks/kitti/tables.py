@@ -35,7 +35,7 @@ FLOOR = ("floor", "truth")  # a filter and its sensor
 
 
 def by_drive(rows: Iterable[dict]) -> pd.DataFrame:
-    """Returns numbers by filter, sensor, condition, window and drive: means of its cameras, then medians of seeds."""
+    """Returns scores by filter, sensor, condition, window and drive: means of its cameras, then medians of seeds."""
     frame = pd.DataFrame(rows, columns=COLUMNS)
     frame["drive"] = frame["drive"].str.split("/").str[0]
     keys = ["filter", "sensor", "condition", "window", "drive"]
@@ -43,7 +43,7 @@ def by_drive(rows: Iterable[dict]) -> pd.DataFrame:
 
 
 class Drives:
-    """Looks up the drives' numbers, a row each; empty where there are none."""
+    """Looks up the scores of the drives, a row for each; empty if there are none."""
 
     def __init__(self, rows: Sequence[dict]):
         self.table = by_drive(rows)
@@ -66,7 +66,7 @@ def plain(values: pd.Series, layout: str = "{:.3g}", factor: float = 1.0) -> str
 
 
 def markdown(rows: Sequence[dict], header: str) -> str:
-    """Returns means over drives for each condition, errors by window, and each drive's own."""
+    """Returns the tables: means over drives for each condition, errors by window, and errors of each drive."""
     methods = sorted({(row["filter"], row["sensor"]) for row in rows if row["filter"] != "floor"}, key=_order)
     windows = sorted({row["window"] for row in rows})
     window = 100 if 100 in windows else windows[-1]
@@ -106,7 +106,7 @@ def markdown(rows: Sequence[dict], header: str) -> str:
 
 
 def _title(rows: Sequence[dict], name: str, seeds: int) -> str:
-    """Returns a filter's title, with its number of seeds where others have more."""
+    """Returns a filter's title, with its number of seeds if others have more."""
     own = len({row["seed"] for row in rows if row["filter"] == name})
     return TITLES.get(name, name) + (f" (at most {own} of {seeds} seeds)" if own < seeds else "")
 
@@ -125,7 +125,7 @@ def _pair(drives: pd.DataFrame, columns: Sequence[str] = END_POINT) -> str:
 
 
 def _reference(drives: Drives, methods: Sequence[tuple[str, str]], window: int) -> list[str]:
-    """Returns the paper's Tables II and III: both metrics, its conditions; and what a filter costs."""
+    """Returns the paper's Tables II and III, with both metrics and its conditions, and the cost of each filter."""
     conditions = ("clean", "salt_and_pepper", "blur", "missing")
     lines = [
         f"Both metrics over {window} steps, end point / path length as in the reference script: m/m, deg/m; parameters "

@@ -1,6 +1,6 @@
-"""The stages of a filter: on the frozen sensor's readings, then end to end; then its two numbers are chosen.
+"""Trains a filter on the frozen sensor's readings, then end to end; then chooses its inflation and speed factor.
 
-These are the inflation, and a factor on all speeds that the sensor reads, where drives that it has not seen share one.
+The factor corrects the sensor's scale error of the speed, if that is significant on drives without training.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ FLOOR = 1e-8  # of the variances of v and theta_dot
 
 @dataclass(frozen=True)
 class Budget:
-    """Updates of each stage; steps of the filter's windows."""
+    """Updates of each stage, and steps of the filter's windows."""
 
     sensor: int = 3000  # updates of the sensor
-    fine_tuning: int = 300  # updates of a sensor that comes trained on rendered drives
+    fine_tuning: int = 300  # updates of a sensor that was pre-trained on rendered drives
     filter: int = 300  # updates of a filter on readings
     end_to_end: int = 40  # updates of sensor and filter together
     length: int = 24  # steps of the filter's windows
@@ -45,7 +45,7 @@ class Budget:
 
 @torch.no_grad()
 def run_filter(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict], seed: int = 0) -> TensorDict:
-    """Filters readings of one length side by side, ``[K, N]``, each from its true first state."""
+    """Filters readings of one length in a batch, ``[K, N]``, each from its true first state."""
     batch = mark_start(torch.stack([reading.copy() for reading in readings]))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -53,7 +53,7 @@ def run_filter(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict
 
 
 def run_all(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> list[TensorDict]:
-    """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
+    """Filters each drive's readings with all and with missing frames, in batches ``[K, N]`` of one length."""
     groups = defaultdict(list)
     for seed, reading in enumerate(readings):
         groups[len(reading)] += [all_frames(reading), lose_frames(reading, seed)]
@@ -61,7 +61,7 @@ def run_all(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) 
 
 
 def filter_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> dict[str, float]:
-    """CRPS of the belief's (v, theta_dot), in units of a good sensor's errors, with and without missing frames."""
+    """Returns the CRPS of (v, theta_dot) in units of a good sensor's errors, with and without missing frames."""
     return {"crps": _crps(recipe, run_all(recipe, model, readings))}
 
 
@@ -71,10 +71,10 @@ def _crps(recipe: KITTIRecipe, runs: Sequence[TensorDict]) -> float:
 
 
 def calibration_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[TensorDict]) -> float:
-    """CRPS of the belief's velocities times its path's distance from the true one, with and without missing frames.
+    """Returns the CRPS of the velocities times the error of the path, with and without missing frames.
 
-    A spread that is right for the velocities can be wrong for the path, which no reading ever sets right: by the
-    coverage of the velocities alone an inflation is chosen that makes the path a fifth worse.
+    A spread that is right for the velocities can be wrong for the path, which no reading corrects: the coverage of the
+    velocities alone chooses an inflation that makes the path a fifth worse.
     """
     runs = run_all(recipe, model, readings)
     apart = [(out["belief", "mean"][..., :2] - out["state"][..., :2]).norm(dim=-1).mean(1) for out in runs]
@@ -82,14 +82,14 @@ def calibration_error(recipe: KITTIRecipe, model: Filter, readings: Sequence[Ten
 
 
 def log_gains(fold: Fold, base: SensorOfFold) -> Tensor:
-    """Returns logarithms of the speed read by the speed driven, over each whole drive that a sensor has not seen."""
+    """Returns the logarithm of the read over the true speed, for each tuning drive without training of its sensor."""
     drives = zip(fold.tune, base.readings[::2], strict=True)
     clean = [torch.cat([first, last]) for part, (first, last, _) in drives if part.stream.condition == "clean"]
     return torch.stack([gain_of(reading) for reading in clean])
 
 
 def certain_gain(gains: Tensor) -> float:
-    """The mean logarithm, if a t test over the drives tells it from 0 at 5 %; else 0."""
+    """Returns the mean logarithm if it is significant (t test over the drives, 5 %), else 0."""
     if len(gains) < 3 or not ttest_1samp(gains.double().numpy(), 0.0).pvalue < 0.05:
         return 0.0
     return float(gains.mean())
@@ -106,7 +106,7 @@ def train_filter(
     budget: Budget,
     loggers: Sequence[str] = ("csv",),
 ) -> tuple[KITTIRecipe, Filter]:
-    """Trains one filter on a fold, or goes on where it was broken off; the model at the end is the best one."""
+    """Trains one filter on a fold, or resumes after an interruption; returns the best model."""
     torch.manual_seed(seed)
     facts, kind = base.facts, base.kind
     sensor = SENSORS[kind](facts)
@@ -115,7 +115,7 @@ def train_filter(
     model = recipe.build()
     gains = log_gains(fold, base)
     gain = certain_gain(gains)
-    # How wrong the first velocity of a training window is; its pose is right.
+    # Standard deviation of a training window's first state: the velocity is noisy, the pose is exact.
     start_std = torch.cat([torch.zeros(3), 0.2 * facts.scale])
 
     def objective(with_sensor: bool) -> nn.Module:
@@ -140,7 +140,7 @@ def train_filter(
                 EndToEndLoss(objective(with_sensor=True), sensor_loss(sensor, facts.unit)),
                 lambda generator, length: frames.windows(generator, length, start_std),
                 budget.end_to_end,
-                # The noise model knows how wrong the sensor is on new drives; on those it has seen it would forget.
+                # The noise model was fitted to errors on new drives; training drives would make it overconfident.
                 parameters=model.parameters(),
                 frozen={"noise"} & set(model.module.keys()),
                 lr=1e-4,
@@ -162,7 +162,7 @@ def train_filter(
         return error()
 
     def gained_error() -> float:
-        if "gain" not in notes:  # behind the last stage, which may have taken the factor out of the sensor
+        if "gain" not in notes:  # after the last stage, which may have removed the sensor's scale error
             notes["gain"] = min((0.0, gain), key=error_with)
             recipe.set_gain(model, notes["gain"])
         return error()

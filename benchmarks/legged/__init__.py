@@ -1,1 +1,1 @@
-"""Estimates how fast a walking robot's base is, by its inertial sensor, joints and feet."""
+"""Estimates the velocity of a walking robot's base from its inertial sensor, joints and feet."""

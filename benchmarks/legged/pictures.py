@@ -1,4 +1,4 @@
-"""The velocity of a robot on slippery ground, as two filters believe it; and a walk with what is believed of it."""
+"""Draws the velocity of a robot on slippery ground by two filters, and a video of the estimated velocity."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ __all__ = ["Camera", "draw"]
 
 
 def draw(robot: Robot, beliefs: Mapping[str, TensorDict], path: Path, *, seconds: tuple[float, float] = (2, 6)) -> None:
-    """Draws three axes of the first run, and below which feet stand.
+    """Draws the velocity along three axes in the first run, and the feet's contacts below.
 
     Args:
         robot: with its log.
         beliefs: of the filters, by name.
         path: PNG.
-        seconds: from when to when.
+        seconds: begin and end of the drawn interval.
     """
     half = NormalDist().inv_cdf((1 + LEVEL) / 2)
     rows = slice(*(round(each / robot.dt) for each in seconds))
@@ -51,11 +51,11 @@ def draw(robot: Robot, beliefs: Mapping[str, TensorDict], path: Path, *, seconds
 
 
 class Camera:
-    """Frames of a robot, which it follows, with arrows above its base.
+    """Camera that follows a robot, and draws arrows above its base.
 
     Args:
         model: of the robot.
-        data: its state, which is looked at when a frame is taken.
+        data: its state, which is read at each frame.
         size: of a frame, height and width.
     """
 
@@ -69,7 +69,7 @@ class Camera:
             self.renderer.scene.flags[flag] = 0
 
     def frame(self, arrows: Mapping[str, Tensor], std: Tensor) -> np.ndarray:
-        """A picture ``[H, W, 3]``.
+        """Returns an image ``[H, W, 3]``.
 
         Args:
             arrows: velocities ``[3]`` in the base's axes, by their colour.

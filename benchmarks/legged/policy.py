@@ -1,4 +1,4 @@
-"""A policy that was trained with the base's true velocity, and walks on what is believed of it.
+"""A policy that was trained with the base's true velocity, and runs on the filter's estimate.
 
 python -m benchmarks.legged.policy --out runs/walk
 """
@@ -46,19 +46,19 @@ GROUNDS = {
     "soft": Ground((0.5, 1.0), (0.05, 0.05), (0.0, 60.0)),
 }
 TRUTH, SPREAD, GAIT = "truth", "belief and spread, trained on them", "nothing: the gait alone"
-#: Where the policy that was trained with the truth gets the velocity from; another policy; and none.
+#: Sources of the velocity for the policy that was trained on the truth; a policy trained on beliefs; no policy.
 ARMS = (TRUTH, "belief", "LSTM", "zero", "integrated inertial sensor", SPREAD, GAIT)
-#: What velocities in m/s, up, turns in rad/s, joints in rad, commands in m/s and the gait's phase are divided by.
+#: Units of velocities in m/s, vertical, angular rates in rad/s, joints in rad, commands in m/s and the gait's phase.
 SCALE = (*[0.3] * 3, 0.2, 0.2, 1.0, *[0.5] * 3, *[0.5] * 16, 0.3, 0.2, 1.0, 1.0)
 SPREADS = (0.05,) * 3  # m/s
 
 
 @dataclass(frozen=True)
 class Study:
-    """Tests how well a policy walks on a belief about its base's velocity."""
+    """Tests a walking policy on a belief about its base's velocity."""
 
-    out: Path = Path("runs/walk")  # folder for policy.md, walk.gif and weights; what is finished is not run again
-    robots: int = 32  # side by side
+    out: Path = Path("runs/walk")  # folder for policy.md, walk.gif and weights; finished parts are not run again
+    robots: int = 32  # in a batch
     seconds: float = 6.0  # of an episode of the training
     test_seconds: float = 8.0
     batches: int = 60  # of one episode of each robot
@@ -69,10 +69,10 @@ class Study:
 
 
 class Reads(Transform):
-    """Writes ``"input"``, all that a policy reads, with the velocity that an arm has.
+    """Writes ``"input"``, the input of a policy, with the velocity of an arm.
 
     Args:
-        arm: whose.
+        arm: source of the velocity.
         sensor: pose of the inertial sensor on the base, ``[7]``.
     """
 
@@ -104,7 +104,7 @@ class Reads(Transform):
 
 
 class Estimates(Transform):
-    """Writes ``"lstm"``, the velocity by a network with a memory, which begins empty."""
+    """Writes ``"lstm"``, the velocity by a recurrent network, whose memory is reset with the environment."""
 
     def __init__(self, network: LSTM):
         super().__init__(out_keys=["lstm"])
@@ -125,7 +125,7 @@ class Estimates(Transform):
 
 
 class Laboratory:
-    """Makes environments and policies of a study, and keeps what they share: the filter, and its compiled step."""
+    """Makes environments and policies of a study, which share the filter and its compiled step."""
 
     def __init__(self, study: Study):
         self.study = study
@@ -135,7 +135,7 @@ class Laboratory:
         self.step, self.network = None, None
 
     def compiled(self) -> None:
-        """Compiles a step of the filter for all robots at once, which takes minutes, and a step then a tenth."""
+        """Compiles a step of the filter for all robots in minutes, which reduces its time to a tenth."""
         file = self.study.out / f"step-{self.study.robots}.pt2"
         if not file.exists():
             row = Walk(self.study.robots, GROUNDS["soft"], 0).reset().select(*READ)
@@ -143,7 +143,7 @@ class Laboratory:
         self.step = load_step(file)
 
     def env(self, arm: str, ground: str, seed: int) -> EnvBase:
-        """Robots on a ground, with what the policy of an arm reads."""
+        """Returns robots on a ground, with the policy's input of an arm."""
         env = TransformedEnv(Walk(self.study.robots, GROUNDS[ground], seed))
         if arm == "integrated inertial sensor":
             env.append_transform(UnaryTransform(["contact"], ["contact"], fn=torch.zeros_like))  # no foot ever stands
@@ -154,7 +154,7 @@ class Laboratory:
         return env.append_transform(Reads(arm, self.sensor))
 
     def agent(self, arm: str, batches: int) -> PPO:
-        """Who learns; its actions begin small."""
+        """Returns a PPO agent with small initial actions."""
         scale = torch.tensor([*SCALE, *(SPREADS if arm == SPREAD else ())])
         settings = Settings(gamma=0.95, lmbda=0.95, minibatch=480, lr=1e-3)
         agent = PPO(Arm(INPUT), Inputs(0, 3, scale, 1.0), settings, batches)
@@ -165,7 +165,7 @@ class Laboratory:
         return agent
 
     def trained(self, arm: str, batches: int) -> PPO:
-        """A policy that was trained with what an arm reads; goes on where it was stopped."""
+        """Returns a policy trained on an arm's input; resumes an interrupted training."""
         agent, file, first = self.agent(arm, batches), self.study.out / f"{arm}.pt", 0
         parts = {"loss": agent.loss, "optimiser": agent.optimiser, "schedule": agent.schedule}
         if file.exists():
@@ -191,7 +191,7 @@ class Laboratory:
         return agent
 
     def lstm(self, agent: PPO) -> LSTM:
-        """Trained to tell the velocity on what a policy does that reads the true one."""
+        """Returns an LSTM that estimates the velocity, trained on the walks of the policy that reads the truth."""
         contacts = LearnedContacts(self.model, **QUADRUPED, rows=ROWS)
         if (file := self.study.out / "lstm" / "lstm.pt").exists():
             network = LSTM(contacts)
@@ -211,7 +211,7 @@ class Laboratory:
 
 
 def scored(data: TensorDict) -> dict[str, Tensor]:
-    """Of each robot the return, the error of its velocity in m/s, and whether it fell; and how wrong the belief was.
+    """Returns each robot's return, velocity error against the command in m/s, falls, and error of the estimate.
 
     Args:
         data: of :func:`play`.
@@ -224,7 +224,7 @@ def scored(data: TensorDict) -> dict[str, Tensor]:
 
 
 def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) -> pd.DataFrame:
-    """A row for each ground, arm and robot; robots, commands and forces are the same for all arms."""
+    """Returns a row for each ground, arm and robot; robots, commands and forces are the same for all arms."""
     study, file = laboratory.study, laboratory.study.out / "policy.csv"
     rows = records(file)
     for (number, ground), arm in product(enumerate(GROUNDS), ARMS):
@@ -243,7 +243,7 @@ def tested(laboratory: Laboratory, policies: dict[str, TensorDictModuleBase]) ->
 
 
 def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
-    """A robot on slippery ground with the command, the true velocity, and what is believed of it."""
+    """Draws a robot on slippery ground with the command, the true and the estimated velocity."""
     alone = Laboratory(replace(laboratory.study, robots=1))
     env = alone.env("belief", list(GROUNDS)[1], laboratory.study.seed + 600)
     robot, frames, rows = env.base_env.robots[0], [], count()
@@ -261,7 +261,7 @@ def film(laboratory: Laboratory, policy: PPO, every: int = 8) -> None:
 
 
 def page(rows: pd.DataFrame, study: Study) -> str:
-    """The tables."""
+    """Returns the tables."""
     text = [
         "# A policy that walks on the belief of its base's velocity",
         "",

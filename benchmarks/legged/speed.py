@@ -1,4 +1,4 @@
-"""Measures what a step costs: thousands of robots in one batch, a loop of single filters, and a packaged step.
+"""Times a filter's step: thousands of robots in one batch, a loop of single filters, and a packaged step.
 
 python -m benchmarks.legged.speed --out benchmarks/legged/results
 """
@@ -23,18 +23,18 @@ from torch_denkf.deployment import export_step, load_step
 
 @dataclass(frozen=True)
 class Speed:
-    """Measures what a step of a legged robot's filter costs."""
+    """Times a step of a legged robot's filter."""
 
     out: Path | None = None  # folder for speed.md
     robots: int = 4096  # in a batch
     rounds: int = 7
-    packaged: tuple[str, ...] = ("EKF",)  # which takes minutes to compile
+    packaged: tuple[str, ...] = ("EKF",)  # filters to package, which takes minutes
     smoke: bool = False  # a few robots, nothing packaged
 
 
 @torch.no_grad()
 def rows(study: Speed) -> pd.DataFrame:
-    """Times each filter: microseconds a robot and step in a batch and alone, and milliseconds packaged."""
+    """Times each filter: microseconds per robot and step, in a batch and alone, and milliseconds packaged."""
     robot, found = simulated("quadruped", 1, 0.1, 0, FIRM), {}
     readings = robot.log[0, 5:7].select("imu", "joints", "joint_rates", "contact")
     for name, options in KINDS.items():
@@ -65,7 +65,7 @@ def main() -> None:
     study = Speed(robots=8, rounds=1, smoke=True) if study.smoke else study
     torch.manual_seed(0)
     text = [
-        "# What a step costs",
+        "# Time of a step",
         "",
         "The simulated quadruped, four feet, single precision. Times are of the processor, one thread: the least of "
         f"{study.rounds} rounds. A batch holds {study.robots:,} robots.",

@@ -1,8 +1,8 @@
-"""A filter that starts with a wrong idea of where up is: how long does it take to find it?
+"""Measures the convergence of filters whose initial belief is tilted.
 
     python -m benchmarks.legged.start --out benchmarks/legged/results
 
-An invariant filter's errors move alike wherever its mean is, so it should gain most where the start is far off.
+The error dynamics of an invariant filter do not depend on its mean, so it should gain most from a large initial error.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ KEPT = [("belief", "mean"), ("belief", "velocity")]
 
 @dataclass(frozen=True)
 class Start:
-    """Measures how long a filter takes to find where up is."""
+    """Measures the convergence of the tilt from a wrong initial belief."""
 
     out: Path | None = None  # folder for start.md
     runs: int = 8
@@ -39,7 +39,7 @@ class Start:
 
 
 def turned(state: Tensor, turn: Tensor) -> Tensor:
-    """States ``[*, 16 + 3 F]`` with the whole world turned about its origin, by quaternions ``[*, 4]``."""
+    """Rotates states ``[*, 16 + 3 F]`` about the world's origin by quaternions ``[*, 4]``."""
     turn = turn.expand(*state.shape[:-1], 4)
     feet = rotate(turn.unsqueeze(-2), state[..., 16:].unflatten(-1, (-1, 3))).flatten(-2)
     moved = [rotate(turn, state[..., 4:7]), rotate(turn, state[..., 7:10]), state[..., 10:16], feet]
@@ -48,12 +48,12 @@ def turned(state: Tensor, turn: Tensor) -> Tensor:
 
 @torch.no_grad()
 def tilts(robot: Robot, kind: str, degrees: float) -> tuple[Tensor, Tensor]:
-    """Tilt's errors in degrees and the velocity's in m/s, ``[R, T]``, of a filter that knows how wrong its start is."""
+    """Returns errors of tilt in degrees and velocity in m/s, ``[R, T]``, of a filter with matching initial noise."""
     noises = LeggedNoises(tilt=max(math.radians(degrees), LeggedNoises().tilt))
     filter = legged_filter(robot.model, **robot.names, dt=robot.dt, noises=noises, **KINDS[kind])
     torch.manual_seed(0)
     first, log = filter.initialise(robot.log[:, 0].clone()), robot.log[:, 1:].clone()
-    way = torch.linspace(0, 2 * math.pi, log.shape[0] + 1)[:-1]  # another axis of each run, level
+    way = torch.linspace(0, 2 * math.pi, log.shape[0] + 1)[:-1]  # another horizontal axis in each run
     turn = SO3().exp(math.radians(degrees) * torch.stack([way.cos(), way.sin(), torch.zeros_like(way)], -1))
     for key in filter.carry_keys:
         value = first[key]

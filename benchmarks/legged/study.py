@@ -24,11 +24,11 @@ from torch_denkf.applications.legged import LearnedContacts, LeggedNoises, legge
 from torch_denkf.applications.legged.quadruped import quadruped
 from torch_denkf.pretrained import from_pretrained, save_pretrained
 
-#: Of the feet, by the joints' angles in m and by their rates in m/s: one pair is chosen in validation.
+#: Noises of the feet, from joint angles in m and from joint rates in m/s: validation chooses one pair.
 KINEMATICS, RATES = (0.01, 0.03, 0.1), (0.3, 1.0)
 #: Gyro in rad/s/sqrt(Hz), accelerometer in m/s^2/sqrt(Hz). The simulated ones are a little above their data sheets.
 SENSOR = (1e-3, 5e-3)
-#: Of a log with uneven stamps: a turn or a force counts for a wrong time. One pair is chosen in validation.
+#: The same for a log with uneven stamps, where each reading is integrated over a wrong time. Validation chooses one.
 STAMPED = ((1e-3, 5e-3), (5e-3, 2e-2), (1e-2, 5e-2), (2e-2, 0.1), (4e-2, 0.2))
 NOISES = ("kinematics", "rate", "gyro", "accelerometer")
 ICUB = "iCub, real"
@@ -42,11 +42,11 @@ SCORES = {
     "tilt": ("tilt, deg", 2),
     "drift": ("drift, %", 1),
     "nees": ("NEES", 2),
-    "held": ("held", 2),
-    "ms": ("ms a step", 0),
+    "held": ("coverage", 2),
+    "ms": ("ms per step", 0),
 }
 HEADS = ("joints' angles, m", "joints' rates, m/s", "gyro, rad/s/sqrt(Hz)", "accelerometer, m/s^2/sqrt(Hz)")
-SHOWN = list(DATA["quadruped"])[1]  # in the picture
+SHOWN = list(DATA["quadruped"])[1]  # in the plot
 VALIDATION_RUNS = 8
 RESULTS = Path(__file__).parent / "results"
 KINDS = {
@@ -64,12 +64,12 @@ Part = Literal["quadruped", "humanoid", "icub"]
 
 @dataclass(frozen=True)
 class Study:
-    """Estimates how fast a walking robot's base is, by its inertial sensor, joints and feet."""
+    """Estimates the velocity of a walking robot's base from its inertial sensor, joints and feet."""
 
     out: Path = Path("runs/legged")  # folder for legged.csv, legged.md and legged.png
-    icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; left out where they are missing
+    icub: Path = Path("../shared/data/icub")  # with walking.npz and model.urdf; skipped if they are missing
     parts: tuple[Part, ...] = ("quadruped", "humanoid", "icub")  # rows of the others are read from legged.csv
-    kinds: tuple[str, ...] = ()  # run these filters alone, with the quadruped's contacts that the library has
+    kinds: tuple[str, ...] = ()  # run only these filters, with the library's contacts of the quadruped
     runs: int = 20  # of the test, on each ground
     seconds: float = 20.0  # of such a run
     training_runs: int = 120  # of 6 s each
@@ -81,7 +81,7 @@ class Study:
 
 @torch.no_grad()
 def run(robot: Robot, **options) -> tuple[TensorDict, float]:
-    """Belief of a filter on a robot's log, and milliseconds of the processor for a step of all runs.
+    """Returns a filter's belief on a robot's log, and processor milliseconds per step of all runs.
 
     Args:
         robot: with its log.
@@ -95,25 +95,25 @@ def run(robot: Robot, **options) -> tuple[TensorDict, float]:
 
 
 def scored(robot: Robot, belief: TensorDict) -> dict[str, float]:
-    """Scores of a belief."""
+    """Returns scores of a belief."""
     return scores(robot, belief["velocity"], belief["velocity_var"], belief["mean"])
 
 
 def in_the_air(robot: Robot) -> Robot:
-    """The same log, in which no foot ever stands: what is left is to integrate the inertial sensor."""
+    """Returns the log without contacts, so that a filter only integrates the inertial sensor."""
     log = robot.log.clone()
     log["contact"] = torch.zeros_like(log["contact"])
     return replace(robot, log=log)
 
 
 def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]], out: Path) -> LeggedNoises:
-    """The noises of a grid under which the true velocity is likeliest.
+    """Returns the noises of a grid with the highest likelihood of the true velocity.
 
     Args:
         make: makes the log.
         name: of the log.
         grid: noises.
-        out: folder with ``validation.csv``; what is in it is not run again.
+        out: folder with ``validation.csv``, whose rows are not run again.
     """
     file, robot = out / "validation.csv", None
     rows = records(file)
@@ -128,13 +128,13 @@ def chosen(make: Callable[[], Robot], name: str, grid: Iterable[dict[str, float]
 
 
 def best(rows: list[dict], name: str) -> LeggedNoises:
-    """The noises of rows of a log under which the true velocity is likeliest."""
+    """Returns the noises with the highest likelihood of the true velocity, from the rows of a log."""
     row = min(pick(rows, data=name), key=lambda row: row["nll"])
     return LeggedNoises(**{key: row[key] for key in NOISES})
 
 
 def feet_grid(smoke: bool) -> list[dict[str, float]]:
-    """Noises of the feet, with those of the simulated sensor."""
+    """Returns candidate noises of the feet, with those of the simulated sensor."""
     pairs = list(product(KINEMATICS, RATES))[: 1 if smoke else None]
     gyro, accelerometer = SENSOR
     return [{"kinematics": k, "rate": r, "gyro": gyro, "accelerometer": accelerometer} for k, r in pairs]
@@ -143,12 +143,12 @@ def feet_grid(smoke: bool) -> list[dict[str, float]]:
 def filter_rows(
     robots: dict[str, Robot], variants: dict[str, dict], kinds: dict[str, dict], integrated: bool = True
 ) -> tuple[list[dict], dict[str, TensorDict]]:
-    """Rows of the library's filters; and their beliefs, by filter, of all runs.
+    """Returns rows of the library's filters, and their beliefs on all runs by filter.
 
     Args:
-        robots: by the name of the data, with logs of one shape, which are filtered side by side.
-        variants: of every filter, by what is behind its name: its noises, and its contacts. The first one's noises are
-            also those of the integrated sensor.
+        robots: by the name of the data, with logs of one shape, which are filtered in one batch.
+        variants: noises and contacts of every filter, by a suffix of its name. The noises of the first variant are also
+            those of the integrated sensor.
         kinds: options of the filters, by name.
         integrated: whether the inertial sensor alone has a row.
     """
@@ -173,20 +173,20 @@ def filter_rows(
 
 
 def still(robot: Robot) -> dict[str, float]:
-    """Scores of a velocity of zero: how fast the robot is."""
+    """Returns scores of a constant zero velocity."""
     zero = torch.zeros_like(robot.log["true", "velocity"])
     return {key: scores(robot, zero, torch.ones_like(zero))[key] for key in ("velocity", "certain")}
 
 
 def page(frame: pd.DataFrame, study: Study) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
-        "# How fast is the base",
+        "# Velocity of a legged base",
         "",
         "Velocity is the root mean square error of the base's velocity, all three axes together, in the base's axes; "
         "tilt that of where up is. Drift is how far the end of the path is off, over the path's length. NEES is the "
         "squared error of the velocity in units of the variance, over its expectation: above 1 a filter is too sure. "
-        f"Held is the share of true velocities within the {LEVEL:.0%} intervals.",
+        f"Coverage is the share of true velocities within the {LEVEL:.0%} intervals.",
     ]
     frame = frame.reindex(columns=["data", "filter", "draws", *SCORES, *NOISES])
     shown = frame[["filter", "draws"]].assign(
@@ -207,7 +207,7 @@ def page(frame: pd.DataFrame, study: Study) -> str:
         "grounds for all simulated rows. iCub has those of the simulated humanoid on firm ground, whose rows were "
         "stamped as unevenly as iCub's. Milliseconds are those of the processor for a step of all "
         f"{study.runs * len(GROUNDS)} runs of a simulated robot, or of iCub's, without compilation, one thread. "
-        "`--kinds` runs some filters again, with exact draws; rows of random draws are of a whole run before.",
+        "`--kinds` runs some filters again, with the quadruped's contacts that the library has.",
         "",
         *markdown(noises.set_axis(HEADS, axis=1)),
         "",
@@ -218,7 +218,7 @@ def page(frame: pd.DataFrame, study: Study) -> str:
 
 
 def again(study: Study, kind: str) -> list[dict]:
-    """Rows of some filters: of all four grounds, with the noises that were chosen before."""
+    """Returns rows of some filters on all grounds, with the noises that were chosen before."""
     if kind == "icub":
         robots = {ICUB: icub(study.icub)}
         names = "humanoid, firm ground, uneven stamps"
@@ -234,7 +234,7 @@ def again(study: Study, kind: str) -> list[dict]:
 
 
 def grounds(study: Study, kind: str) -> dict[str, Robot]:
-    """A simulated robot's test logs."""
+    """Returns a simulated robot's test logs."""
     return {
         name: simulated(kind, study.runs, study.seconds, study.seed + 3 + number, ground)
         for number, (name, ground) in enumerate(DATA[kind].items())
@@ -242,7 +242,7 @@ def grounds(study: Study, kind: str) -> dict[str, Robot]:
 
 
 def walked(study: Study, kind: str) -> list[dict]:
-    """The rows of a simulated robot; of the quadruped the picture and the trained filter are left in the folder."""
+    """Returns the rows of a simulated robot; for the quadruped it also saves the plot and the trained filter."""
     length = 0.3 if study.smoke else 6.0
     make = partial(simulated, kind, VALIDATION_RUNS, length, study.seed + 2)
     noises = chosen(make, f"{kind}, all grounds", feet_grid(study.smoke), study.out)
@@ -269,7 +269,7 @@ def walked(study: Study, kind: str) -> list[dict]:
 
 
 def _save(contacts: LearnedContacts, noises: LeggedNoises, study: Study) -> None:
-    """Leaves the quadruped's filter with its trained contacts in the folder, for ``from_pretrained``."""
+    """Saves the quadruped's filter with its trained contacts in the folder, for ``from_pretrained``."""
     settings: dict = {"num_cells": list(CELLS), **{key: getattr(noises, key) for key in NOISES}}
     filter = quadruped(**settings)
     trained = next(module for module in filter.modules() if isinstance(module, LearnedContacts))
@@ -279,7 +279,7 @@ def _save(contacts: LearnedContacts, noises: LeggedNoises, study: Study) -> None
 
 
 def real(study: Study) -> list[dict]:
-    """The rows of iCub."""
+    """Returns the rows of iCub."""
     robot = icub(study.icub)
     make = partial(simulated, "humanoid", VALIDATION_RUNS, 6.0, study.seed + 2, FIRM)
     firm = chosen(make, "humanoid, firm ground", feet_grid(study.smoke), study.out)
@@ -306,7 +306,7 @@ def main() -> None:
     for part in [part for part in study.parts if part in parts]:
         began = time.monotonic()
         made = again(study, part) if study.kinds else parts[part](study)
-        # A whole run replaces all rows of its data; some filters, their own alone.
+        # A full run replaces all rows of its data, a run of some filters only those of these filters.
         replaced = {(row["data"], row["filter"] if study.kinds else None) for row in made}
         rows = [row for row in rows if (row["data"], row["filter"] if study.kinds else None) not in replaced]
         rows += made

@@ -1,4 +1,4 @@
-"""Logs of a simulated quadruped, a simulated humanoid and a real one, and how well a filter knows the base's motion."""
+"""Logs of a simulated quadruped, a simulated humanoid and a real one, and scores of a filter on them."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ __all__ = [
 ]
 
 LEVEL = 0.9  # of the intervals
-ROWS, EVERY = 10, 5  # the learned contacts read ten rows, each five rows after the one before it
+ROWS, EVERY = 10, 5  # the learned contacts read ten rows, every fifth
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A floor, and what happens on it. Each run draws between the least and the most, of which each is one.
+    """Ranges of the floor's properties and of forces on the robot, from which each run draws.
 
     Attributes:
-        friction: drawn by its logarithm.
+        friction: drawn uniformly in its logarithm.
         softness: seconds in which the floor gives way.
         pushes: standard deviation in N of forces on the base.
     """
@@ -75,8 +75,8 @@ class Robot:
         names: of its feet, sensor and joints.
         dt: of the filter: seconds, or the key of them.
         log: ``[R, T]``, readings and truth.
-        rows: that are scored.
-        doubtful: rows ``[R, T]`` of which the truth is in doubt.
+        rows: to score.
+        doubtful: mask ``[R, T]`` of rows with an uncertain truth.
     """
 
     name: str
@@ -89,21 +89,21 @@ class Robot:
 
 
 def _trots(random: np.random.Generator, options: dict[str, float]) -> tuple[LeggedEnv, Callable[[float], Tensor]]:
-    """A quadruped, and its controls at a time."""
+    """Returns a quadruped, and its controls as a function of time."""
     low, high = [0.8, 0.2, 0.2, -0.3], [1.2, 0.4, 0.4, 0.3]
     gait = dict(zip(("pace", "stride", "height", "turn"), random.uniform(low, high).tolist(), strict=True))
     return quadruped_env(**options), lambda time: min(1.0, time) * trot(time, **gait)
 
 
 def _strolls(random: np.random.Generator, options: dict[str, float]) -> tuple[LeggedEnv, Callable[[float], Tensor]]:
-    """A humanoid in its harness, and its controls."""
+    """Returns a humanoid in its harness, and its controls as a function of time."""
     pace, stride, lift, turn, fits = random.uniform([0.8, 0.12, 0.3, -0.2, 0.9], [1.1, 0.22, 0.5, 0.2, 1.1]).tolist()
-    options["pushes"] *= 0.4  # as it weighs
+    options["pushes"] *= 0.4  # in proportion to its weight
     env = humanoid_env(**options, speed=2.5 * fits * stride * pace, turn=turn)
     return env, lambda time: stroll(time, pace=pace, stride=min(1.0, time) * stride, lift=min(1.0, time) * lift)
 
 
-#: Simulated robots: names of their parts, and how one begins to walk.
+#: Simulated robots: names of their parts, and the function that makes one with its gait.
 SIMULATED: dict[str, tuple[dict[str, Any], Callable]] = {
     "quadruped": (QUADRUPED, _trots),
     "humanoid": (HUMANOID, _strolls),
@@ -111,14 +111,14 @@ SIMULATED: dict[str, tuple[dict[str, Any], Callable]] = {
 
 
 def simulated(kind: str, runs: int, seconds: float, seed: int, ground: Ground | None = None) -> Robot:
-    """A robot of dm_control that walks at a pace, with strides and turns of its own in each run; all sensors err.
+    """Returns a walking robot of dm_control, with other strides and turns in each run and noise on all sensors.
 
     Args:
         kind: one of ``SIMULATED``.
         runs: R.
         seconds: of a run, 100 rows each.
         seed: of grounds, gaits and errors.
-        ground: that it walks on; ``None`` for that of training.
+        ground: of the walk; ``None`` for that of training.
     """
     random, logs, ground = np.random.default_rng(seed), [], Ground() if ground is None else ground
     names, walks = SIMULATED[kind]
@@ -138,7 +138,7 @@ def simulated(kind: str, runs: int, seconds: float, seed: int, ground: Ground | 
 
 
 def icub(folder: Path) -> Robot:
-    """The walk of iCub. Its truth is in doubt where motion capture moves a foot that carries the whole robot.
+    """Returns the walk of iCub; its truth is doubtful where motion capture moves the stance foot.
 
     Args:
         folder: with ``model.urdf`` and ``walking.npz``.
@@ -153,7 +153,7 @@ def icub(folder: Path) -> Robot:
 
 
 def jittered(robot: Robot, like: Robot) -> Robot:
-    """A robot whose rows are stamped as unevenly as those of another: ``"dt"`` is what the stamps say."""
+    """Returns a robot whose time stamps ``"dt"`` are as uneven as those of another."""
     dt = like.log["dt"][:, 1:, 0]
     late = dt.std() / 2**0.5 * torch.randn(*robot.log.shape, 1).to(dt)
     steps = robot.dt + torch.cat([torch.zeros_like(late[:, :1]), late.diff(dim=1)], 1)
@@ -162,26 +162,26 @@ def jittered(robot: Robot, like: Robot) -> Robot:
 
 
 def base_pose(robot: Robot, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Orientation and position of the base, of beliefs about its sensor ``[R, T, 16 + 3 F]``."""
+    """Returns orientation and position of the base from beliefs about its sensor ``[R, T, 16 + 3 F]``."""
     sensor = LegKinematics(robot.model, **robot.names).base.to(mean.dtype)
     turn = SO3().compose(mean[..., :4], SO3().inverse(sensor[:4]).expand_as(mean[..., :4]))
     return turn, mean[..., 7:10] - rotate(turn, sensor[4:])
 
 
 def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = None) -> dict[str, float]:
-    """Tells how wrong the base's velocity, tilt and path are, and how wide the velocity's intervals.
+    """Returns errors of the base's velocity, tilt and path, and the calibration of the velocity.
 
     Args:
         robot: with its log.
         velocity: of the base in its own axes, ``[R, T, 3]``.
         var: its variances.
-        mean: of a filter ``[R, T, 16 + 3 F]``; ``None`` where only the velocity is known.
+        mean: of a filter ``[R, T, 16 + 3 F]``; ``None`` if only the velocity is known.
 
     Returns:
-        ``velocity``, the root mean square error of the velocity in m/s, and ``certain``, the same without rows whose
-        truth is in doubt; ``held``, the share of the true velocities in the intervals; ``nees``, the mean of square
+        ``velocity``, the root mean square error of the velocity in m/s, and ``certain``, the same without rows with an
+        uncertain truth; ``held``, the coverage of the intervals; ``nees``, the mean of square
         error by variance; ``nll``, the mean negative log-likelihood. With ``mean`` also ``tilt`` in degrees, and
-        ``drift``, how far the end of the path is off, in % of its length.
+        ``drift``, the error at the end of the path in % of its length.
     """
     true, rows, half = robot.log["true"], robot.rows, NormalDist().inv_cdf((1 + LEVEL) / 2)
     error, var = (velocity - true["velocity"])[:, rows], var[:, rows]
@@ -207,12 +207,12 @@ def scores(robot: Robot, velocity: Tensor, var: Tensor, mean: Tensor | None = No
 
 
 def _length(position: Tensor) -> Tensor:
-    """The length of a path without the noise of single rows: of its places every 10 rows."""
+    """Returns the length of a path, from every tenth row to average out noise."""
     return position[:, ::10].diff(dim=1).norm(dim=-1).sum(1)
 
 
 def _from_start(turn: Tensor, place: Tensor) -> Tensor:
-    """Places as seen from the first one, along its heading."""
+    """Returns places relative to the first one, in the axes of its heading."""
     forward = rotate(turn[:, 0], turn.new_tensor([1.0, 0.0, 0.0]))
     angle = torch.atan2(forward[:, 1], forward[:, 0])
     heading = SO3().exp(angle.unsqueeze(-1) * turn.new_tensor([0.0, 0.0, 1.0]))

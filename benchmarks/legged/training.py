@@ -1,4 +1,4 @@
-"""Learned contacts, trained by how feet move, and a recurrent network in the filter's place."""
+"""Trains learned contacts by the velocities of standing feet, and a recurrent network instead of the filter."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ __all__ = ["CELLS", "LSTM", "VELOCITY", "learned_contacts", "trained_lstm"]
 
 VELOCITY, VAR = ("belief", "velocity"), ("belief", "velocity_var")
 CELLS = (48, 48)  # of the learned contacts' networks: their weights take 83 KB
-LASTS = (1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 20.0)  # rows for which errors of the learned contacts may last
+LASTS = (1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 20.0)  # candidate correlation times of the contacts' errors, in rows
 SETTINGS = {"loggers": (), "device": "cpu", "seed": 0}
-_SETTLING = 10  # rows of a window that are not scored: the memory begins empty
+_SETTLING = 10  # first rows of a window, not scored because the memory begins empty
 
 
 def learned_contacts(robot: Robot, validation: Robot, noises: LeggedNoises, updates: int, out: Path) -> LearnedContacts:
-    """Trains contacts by the likelihood of how standing feet move, and chooses for how long their errors last.
+    """Trains contacts by the likelihood of standing feet's velocities, and chooses their errors' correlation time.
 
-    They last for the fewest rows with which an extended filter's squared error is no more than it expects.
+    It is the smallest with which an extended Kalman filter's squared error is no more than its covariance.
 
     Args:
         robot: with the logs of the training.
-        validation: with other logs, on which that is looked at.
+        validation: with other logs, for that choice.
         noises: of the filter.
         updates: of the network, each by 512 rows.
         out: folder of the training.
@@ -54,10 +54,10 @@ def learned_contacts(robot: Robot, validation: Robot, noises: LeggedNoises, upda
 
 
 class LSTM(nn.Module):
-    """Velocity of the base and its variances, by what the learned contacts read of the last row.
+    """LSTM that estimates the base's velocity and its variances, from the learned contacts' features of each row.
 
     Args:
-        contacts: whose features it reads.
+        contacts: with the features.
         hidden_size: of the memory.
     """
 
@@ -71,12 +71,12 @@ class LSTM(nn.Module):
         self.register_buffer("scale", torch.ones(self.features))
 
     def read(self, log: TensorDict) -> Tensor:
-        """Features ``[R, T, N]`` of a log."""
+        """Returns features ``[R, T, N]`` of a log."""
         keys = ("imu", "joints", "joint_rates", "contact")
         return self.contacts[0].features(*(log[key] for key in keys), rows=1).flatten(-2)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Velocities and variances ``[R, T, 3]``."""
+        """Returns velocities and variances ``[R, T, 3]``."""
         mean, spread = self.head(self.memory((features - self.loc) / self.scale)[0]).split(3, -1)
         return mean, F.softplus(spread) + 1e-5
 
@@ -84,12 +84,12 @@ class LSTM(nn.Module):
 def trained_lstm(
     robot: Robot, validation: Robot, contacts: LearnedContacts, updates: int, out: Path, window: int = 200
 ) -> LSTM:
-    """Trains it on the same logs, by the same likelihood; what it was when it did best in validation is kept.
+    """Trains the LSTM by the likelihood of the true velocity, and returns the best one in validation.
 
     Args:
         robot: with the logs of the training.
         validation: with other logs.
-        contacts: whose features it reads.
+        contacts: with the features.
         updates: each by one window of 24 runs, in which the memory begins empty.
         out: folder of the training.
         window: rows.

@@ -1,4 +1,4 @@
-"""Quadrupeds that are to walk at a commanded velocity, while ropes pull at them."""
+"""An environment of quadrupeds that walk at a commanded velocity under random forces."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from torch_denkf.functional.manifolds import SO3, rotate
 
 __all__ = ["EVERY", "Walk", "acted", "gait", "play", "up_of"]
 
-EVERY = 5  # rows of 0.01 s for which an action holds
-PACE, LIFT = 1.5, 0.4  # strides a second; by how much a leg that swings is lifted
-NOMINAL = 0.4  # m of stride for each m/s that is commanded: what the gait needs at a friction of 0.5
-LIMIT = (0.15, 0.15, 0.15)  # of what an action adds: forwards and to the left in m, turn in rad
+EVERY = 5  # rows of 0.01 s per action
+PACE, LIFT = 1.5, 0.4  # strides per second; control that lifts a swinging leg
+NOMINAL = 0.4  # m of stride for each m/s of the command, right for a friction of 0.5
+LIMIT = (0.15, 0.15, 0.15)  # largest change of the stride by an action: forwards and to the left in m, turn in rad
 MOTOR, STRENGTH, LOAD = 1000.0, (0.8, 2.5), (0.0, 40.0)  # stiffness in Nm; factors on it; kg on the robot's back
 FASTEST = (0.35, 0.2)  # of commands, m/s
-WIDTH = 0.15  # m/s off at which the reward falls to 1 / e
+WIDTH = 0.15  # m/s, error at which the reward falls to 1 / e
 _ANGLES = math.pi / 4 * torch.tensor([1.0, -1.0, -3.0, 3.0])  # of the legs: front left, front right, back right, left
 _OUT = torch.stack([_ANGLES.cos(), _ANGLES.sin()], -1)
 _ALONG = torch.stack([-_ANGLES.sin(), _ANGLES.cos()], -1)
 
 
 def gait(phase: Tensor, stride: Tensor) -> Tensor:
-    """Controls ``[*B, 12]`` of a trot whose feet go straight in any direction.
+    """Returns controls ``[*B, 12]`` of a trot whose feet move straight in any direction.
 
     Args:
         phase: in rad, ``[*B, 1]``.
-        stride: how far feet go to and fro: forwards and to the left in m, turn in rad, ``[*B, 3]``.
+        stride: amplitude of the feet: forwards and to the left in m, turn in rad, ``[*B, 3]``.
     """
     phase = phase + math.pi * torch.tensor([0.0, 1.0, 0.0, 1.0])  # [*B, 4]
     foot = stride[..., None, :2] + 0.83 * stride[..., None, 2:] * _ALONG  # legs end 0.83 m from the middle
@@ -46,17 +46,17 @@ def gait(phase: Tensor, stride: Tensor) -> Tensor:
 
 
 class Walk(EnvBase):
-    """Robots side by side, 100 rows a second. An ``"action"`` ``[3]`` in [-1, 1] adds to the strides of their gait.
+    """A batch of robots, 100 rows per second. An ``"action"`` ``[3]`` in [-1, 1] adds to the strides of their gait.
 
-    Emits what each robot reads, the truth, and ``"command"`` ``[2]``, the velocity that is wanted in the base's axes,
+    Emits each robot's readings, the truth, and ``"command"`` ``[2]``, the target velocity in the base's axes,
     in m/s, which changes every 2 to 4 s; and ``"phase"`` ``[2]``, cosine and sine, of the gait. The reward of a row is
-    1 where the base moves as commanded and does not turn. Friction, floor, motors and load are drawn at the reset.
+    1 if the base moves as commanded and does not turn. Friction, floor, motors and load are drawn at the reset.
 
     Args:
         count: robots, B.
-        ground: what they walk on; ``pushes`` are here the standard deviations of a level force in N, which holds for 1
+        ground: of the walk; ``pushes`` are the standard deviations of a horizontal force in N, which changes every 1
             to 3 s.
-        seed: of all that is drawn.
+        seed: of all random numbers.
     """
 
     def __init__(self, count: int, ground: Ground, seed: int):
@@ -104,7 +104,7 @@ class Walk(EnvBase):
         return self._with_command(out)
 
     def _with_command(self, out: TensorDict) -> TensorDict:
-        """Draws new commands and forces where it is time."""
+        """Draws new commands and forces when due."""
         for number, robot in enumerate(self.robots):
             if self.row >= self.until[number, 0]:
                 self.command[number] = torch.tensor(self.random.uniform(-1, 1, 2) * FASTEST)
@@ -118,7 +118,7 @@ class Walk(EnvBase):
 
 
 def up_of(turn: Tensor) -> Tensor:
-    """Returns where up is in the axes of an orientation ``[*, 4]``."""
+    """Returns the vertical in the axes of an orientation ``[*, 4]``."""
     return rotate(SO3().inverse(turn), turn.new_tensor([0.0, 0.0, 1.0]).expand(*turn.shape[:-1], 3))
 
 
@@ -130,14 +130,14 @@ def play(
     keep: list,
     watch: Callable[[TensorDict], None] = lambda row: None,
 ) -> TensorDict:
-    """Some entries of an episode ``[B, T]``, in which a policy acts every fifth row.
+    """Returns some entries of an episode ``[B, T]``, in which a policy acts every fifth row.
 
     Args:
         env: a :class:`Walk`, maybe with transforms.
         policy: writes ``"action"``.
         rows: T.
         keep: keys before and after a step.
-        watch: is shown each row.
+        watch: called with each row.
     """
     row, found = env.reset(), []
     for number in range(rows):
@@ -151,7 +151,7 @@ def play(
 
 
 def acted(data: TensorDict) -> TensorDict:
-    """Of rows ``[B, T]`` those at which the policy acted, with the mean reward until it acted again."""
+    """Returns the rows of ``[B, T]`` with an action, and the mean reward until the next action."""
     out = data[:, ::EVERY].clone(False).set("next", data["next"][:, EVERY - 1 :: EVERY])
     out["next", "reward"] = data["next", "reward"].unflatten(1, (-1, EVERY)).mean(2)
     for key in ("done", "terminated"):

@@ -1,9 +1,9 @@
 r"""AD-EnKF on Lorenz-96: the forcing and the model noise learned from observations alone, without any true state.
 
 The system has 40 variables, forcing F = 8 and Gaussian model noise N(0, 0.2^2) after every step of 0.05 time units.
-The filter knows the equations but starts from F = 5 (a system that hardly is chaotic) and, where it is learned, a
-model noise of 1. What is minimised is the negative log-likelihood of the innovations of an ensemble Kalman filter
-with perturbed observations, back-propagated through the filter, cut every few steps
+The filter knows the equations but starts from F = 5 (a system that is hardly chaotic) and, if it is learned, a
+model noise of 1. The loss is the negative log-likelihood of the innovations of an ensemble Kalman filter
+with perturbed observations, back-propagated through the filter, and truncated every few steps
 (:meth:`torch_denkf.objectives.DEnKFLoss.ad_enkf`). Windows of the record start from their first observation.
 
     python -m benchmarks.lorenz96 ad_enkf       # the table of benchmarks/lorenz96/results/ad_enkf.md
@@ -53,7 +53,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Returns what is observed, and what is learned."""
+        """Returns the observed variables, the taper's radius and the learned parameters."""
         observed = "all" if self.every == 1 else f"1 in {self.every}"
         return f"{observed} | {self.radius or 'none'} | {'F, Q' if self.learn_noise else 'F'}"
 
@@ -62,7 +62,7 @@ CASES = [Case(1, None, False), Case(1, 5.0, False), Case(1, 5.0, True), Case(2, 
 
 
 def run(case: Case, seed: int, variables: int, steps: int, updates: int, ensemble_size: int) -> tuple[str, float]:
-    """Learns from one record; the row of the table, and the last error of F in per cent."""
+    """Learns from one record; returns the row of the table, and the final error of F in per cent."""
     rng = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     record = observe(simulate(variables, steps, 1, rng), case.every, rng)
@@ -76,7 +76,7 @@ def run(case: Case, seed: int, variables: int, steps: int, updates: int, ensembl
     elapsed, forcing = time.perf_counter() - began, forcing_of(denkf).item()
     scores.append(evaluate(denkf, unseen, unseen_record, 50))
     noise = noise_of(denkf)
-    with torch.no_grad():  # last, because it overwrites what was learned: the filter that knows the truth
+    with torch.no_grad():  # last, because the true F and Q overwrite the learned ones
         forcing_of(denkf).fill_(FORCING)
         denkf["transition"].module["noise"].log_variance.fill_(2 * log(NOISE))
     scores.append(evaluate(denkf, unseen, unseen_record, 50))
@@ -89,9 +89,9 @@ def run(case: Case, seed: int, variables: int, steps: int, updates: int, ensembl
 
 @dataclass
 class ADEnKF:
-    """Lorenz-96's forcing and model noise, learned from observations alone."""
+    """Learns Lorenz-96's forcing and model noise from observations alone."""
 
-    seeds: int = 3  # records learned from, one after the other
+    seeds: int = 3  # number of records, each for one training
     updates: int = 150  # of Adam
     steps: int = 2000  # of a record
     ensemble: int = 50  # members
@@ -113,7 +113,7 @@ class ADEnKF:
 
 
 def page(options: ADEnKF, rows: list[str], errors: list[float], seconds: float) -> str:
-    """The page of results."""
+    """Returns the page of results."""
     lines = [
         "# AD-EnKF: Lorenz-96's forcing from observations alone",
         "",

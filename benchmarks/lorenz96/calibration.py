@@ -1,6 +1,7 @@
-"""A simulated system with a biased, heteroscedastic sensor: is the trained filter better than its sensor, and honest?
+"""Trains filters on a simulated system with a biased, heteroscedastic sensor, and compares error and calibration of
+several losses.
 
-A particle in the plane, state [x, y, vx, vy]: a spring pulls it to the origin, a cross wind turns it, random gusts
+A particle in the plane, state [x, y, vx, vy]: a spring pulls it to the origin, a cross wind deflects it, random gusts
 push it. Four noisy instruments read it through a saturating curve; one half of the plane is foggy (noise six times
 larger, and a bias). Everything is learned: transition, observation model, noise model, sensor. Every loss trains the
 same networks (the paper's Table I) on the same runs for the same number of updates.
@@ -104,7 +105,7 @@ def evaluate(denkf: DEnKF, data: TensorDict, seed: int) -> dict[str, float]:
 
 @dataclass
 class Calibration:
-    """A biased, heteroscedastic sensor: is the trained filter better than its sensor, and honest?"""
+    """Options of the study of a biased, heteroscedastic sensor."""
 
     updates: int = 1000
     seeds: int = 3

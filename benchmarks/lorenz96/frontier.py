@@ -1,9 +1,9 @@
-"""Error against milliseconds a step on Lorenz-96: ensemble filters of many sizes beside EKF, UKF and particle filter.
+"""Error against milliseconds per step on Lorenz-96: ensemble filters of many sizes, EKF, UKF, particle filter.
 
 The standard set-up of :mod:`benchmarks.lorenz96.schemes`: 40 variables, all observed with unit variance, no model
-noise. All filters know the equations and R. Each filter, at each size, gets one setting on validation records: an
-ensemble filter its inflation and the radius of its localisation, a Gaussian filter its inflation, the particle
-filter the width of the kernel that moves copies apart.
+noise. All filters know the equations and R. Validation records choose one setting of each filter and size: the
+inflation and the radius of the localisation of an ensemble filter, the inflation of a Gaussian filter, the width of the
+particle filter's jitter kernel.
 
     python -m benchmarks.lorenz96 frontier      # benchmarks/lorenz96/results/frontier.{md,csv,png}
 """
@@ -39,16 +39,16 @@ from torch_denkf.modules import (
     Select,
 )
 
-TIMED, RUNS = 50, 10  # steps of one record, so many times
+TIMED, RUNS = 50, 10  # timed steps of one record, and repetitions
 DIMS = list(range(VARIABLES))
-FEW = 32  # up to so many members may be localised: more do without, and local systems of many members take seconds
-ROTATED = 128  # up to so many members run as an etkf: the rotation of more takes longer than the step
+FEW = 32  # largest localised ensemble: larger ones do not need it, and their local systems take seconds
+ROTATED = 128  # largest etkf: the rotation of more members takes longer than the step
 
 INFLATIONS, RADII = (1.0, 1.01, 1.02, 1.04, 1.07, 1.12), (4.0, 8.0, None)
 GAUSSIAN_INFLATIONS = (1.02, 1.05, 1.1, 1.2, 1.3, 1.5)
 KERNELS = (0.25, 0.5, 1.0, 2.0)
 SCHEMES = {"DEnKF, stochastic": "perturbed", "DEnKF, etkf": "etkf", "DEnKF, sakov": "sakov"}
-SHOWN = 2.0  # a filter that errs by more has lost its system: its readings err by 1
+SHOWN = 2.0  # a filter with a larger error has diverged: the readings' error is 1
 Make = Callable[[], Filter]
 
 
@@ -59,7 +59,7 @@ def _models() -> dict:
 
 
 def ensemble(scheme: str, size: int, radius: float | None, inflation: float) -> Filter:
-    """The DEnKF with one of the schemes; a localised ``"etkf"`` is the LETKF."""
+    """Returns the DEnKF with one of the schemes; a localised ``"etkf"`` is the LETKF."""
     keys = {"inflation": inflation, "rotate": scheme == "etkf", "observation_key": "observation"}
     if scheme == "etkf" and radius is not None:
         places = torch.arange(float(VARIABLES)).unsqueeze(-1)
@@ -71,20 +71,20 @@ def ensemble(scheme: str, size: int, radius: float | None, inflation: float) -> 
 
 
 def gaussian(kind: type[EKF | UKF], inflation: float) -> Filter:
-    """An extended or unscented Kalman filter."""
+    """Returns an extended or unscented Kalman filter."""
     keys = {"observation_key": "observation", "inflation": inflation, "process_noise": 0.0}
     return kind(**_models(), initial=GaussianAround([1.0] * VARIABLES), **keys)
 
 
 def particles(size: int, kernel: float) -> Filter:
-    """A bootstrap filter, regularised."""
+    """Returns a regularised bootstrap filter."""
     initial = AroundState([1.0] * VARIABLES, ensemble_size=size)
     likelihood = GaussianLikelihood(observation_key="observation")
     return ParticleFilter(**_models(), likelihood=likelihood, jitter=kernel, initial=initial)
 
 
 def candidates(sizes: Iterable[int]) -> dict[tuple[str, int], dict[str, Make]]:
-    """Filters by name and size, and their settings."""
+    """Returns filters by name and size, and their settings."""
     found: dict[tuple[str, int], dict[str, Make]] = {}
     for (name, scheme), size in product(SCHEMES.items(), sizes):
         if scheme == "etkf" and size > ROTATED:
@@ -101,7 +101,7 @@ def candidates(sizes: Iterable[int]) -> dict[tuple[str, int], dict[str, Make]]:
 
 
 def row_of(name: str, size: int, settings: dict[str, Make], data: dict[str, TensorDict], skip: int, chunk: int) -> dict:
-    """Chooses a setting on the validation records; its error on the test records, and its time."""
+    """Chooses a setting on the validation records, and returns its error on the test records and its time."""
     scores = {}
     for setting, make in settings.items():
         torch.manual_seed(0)
@@ -124,18 +124,18 @@ def _rows(*arguments) -> list[dict]:
 
 @dataclass
 class Frontier:
-    """Error against milliseconds a step: ensemble filters of many sizes, EKF, UKF, particle filter."""
+    """Measures error and milliseconds per step: ensemble filters of many sizes, EKF, UKF, particle filter."""
 
     sizes: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512, 1024)  # members
-    records: int = 4  # to choose by, and as many to test on
+    records: int = 4  # for validation, and as many for the test
     steps: int = 600  # of each
-    burn_in: int = 100  # of these, which do not count
+    burn_in: int = 100  # first steps, which are not scored
     out: Path = Path("benchmarks/lorenz96/results/frontier.md")
-    rows: Path = Path("runs/lorenz96-frontier")  # what was broken off goes on from here
+    rows: Path = Path("runs/lorenz96-frontier")  # an interrupted run resumes from here
     smoke: bool = False  # one size on short records, nothing compiled, nothing written
 
     def __call__(self) -> None:
-        """Writes the page, the rows and the picture."""
+        """Writes the page, the rows and the plot."""
         if self.smoke:
             self.sizes, self.records, self.steps, self.burn_in = (8,), 1, 10, 5
         began = time.perf_counter()
@@ -159,7 +159,7 @@ class Frontier:
 
     def _page(self, rows: list[dict], seconds: float) -> str:
         lines = [
-            "# Lorenz-96: error against milliseconds a step",
+            "# Lorenz-96: error against milliseconds per step",
             "",
             f"{VARIABLES} variables, all observed with R = 1, no model noise, steps of 0.05 time units; all "
             f"filters know the equations and R, and begin around the truth with a standard deviation of 1. The "
@@ -167,14 +167,14 @@ class Frontier:
             f"of {self.steps} steps without the first {self.burn_in}. The readings' own RMSE is 1. ms: processor "
             f"time, one record, one thread, the least of {RUNS} runs of {TIMED} steps, each step compiled.",
             "",
-            *head("filter", "members", "setting", "RMSE, validation", "RMSE", "ms a step", "ms, not compiled"),
+            *head("filter", "members", "setting", "RMSE, validation", "RMSE", "ms per step", "ms, not compiled"),
         ]
         for row in rows:
             numbers = (f"{row[k]:.3f}" for k in ("validation_rmse", "rmse", "ms_per_step", "eager_ms_per_step"))
             lines.append(line(row["filter"], row["members"], row["setting"], *numbers))
         lines += [
             "",
-            "![RMSE against milliseconds a step](frontier.png)",
+            "![RMSE against milliseconds per step](frontier.png)",
             "",
             *made_by("lorenz96", f", {seconds:.0f} s"),
         ]

@@ -1,4 +1,4 @@
-"""Lorenz-96 with unknown forcing and model noise: records of it, the filter that learns them, and the learning."""
+"""Lorenz-96 with unknown forcing and model noise: simulated records, the filter, and its training."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, FromSensor, Lea
 from torch_denkf.objectives import DEnKFLoss
 
 FORCING, NOISE, R = 8.0, 0.2, 1.0  # of the true system: F; model noise and observation noise, standard deviations
-START, NOISE_START = 5.0, 1.0  # where learning begins
-BATCH, WARM_UP, WINDOW = 8, 20, 40  # windows in an update; steps before a window, and of it
+START, NOISE_START = 5.0, 1.0  # F and model noise before training
+BATCH, WARM_UP, WINDOW = 8, 20, 40  # windows in an update; steps before a window, and in it
 SPIN_UP = 500  # steps from a random state to the attractor
 
 
@@ -36,27 +36,27 @@ class Lorenz96(nn.Module):
 
 
 def tapers(dims: Sequence[int], variables: int, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Factors on the covariances of the variables and the observed ones ``[N, O]``, and of the observed ``[O, O]``.
+    """Returns factors on the covariances of all with observed variables ``[N, O]``, and among observed ``[O, O]``.
 
-    With few members correlations of variables far apart are noise; AD-EnKF tapers them in gain and likelihood alike.
+    With few members, correlations of distant variables are spurious; AD-EnKF tapers them in gain and likelihood.
 
     Args:
         dims: the observed variables, of those on the circle.
         variables: N, on the circle.
-        radius: distance at which correlations have fallen to 5/24; they are zero from twice that on.
+        radius: distance at which the factor is 5/24; it is zero from about twice that on.
     """
     observed, places = torch.as_tensor(dims), torch.arange(variables)
     return tuple(gaspari_cohn(on_circle(first, observed, variables), radius * 0.3**0.5) for first in (places, observed))
 
 
 def on_circle(first: torch.Tensor, second: torch.Tensor, variables: int) -> torch.Tensor:
-    """Distances ``[len(first), len(second)]`` between places on a circle."""
+    """Returns distances ``[len(first), len(second)]`` between places on a circle."""
     distance = (first.unsqueeze(-1) - second).abs()
     return torch.minimum(distance, variables - distance)
 
 
 def simulate(variables: int, steps: int, records: int, rng: torch.Generator) -> torch.Tensor:
-    """True states ``[records, steps, variables]`` on the attractor."""
+    """Returns true states ``[records, steps, variables]`` on the attractor."""
     state = FORCING + torch.randn(records, variables, generator=rng)
     states = []
     for _ in range(SPIN_UP + steps):
@@ -66,7 +66,7 @@ def simulate(variables: int, steps: int, records: int, rng: torch.Generator) -> 
 
 
 def observe(states: torch.Tensor, every: int, rng: torch.Generator) -> TensorDict:
-    """Returns what the filter gets: ``observation`` ``[*B, T, variables / every]``, and nothing else."""
+    """Returns the filter's only input: ``observation`` ``[*B, T, variables / every]``."""
     seen = states[..., ::every]
     return TensorDict({"observation": seen + R * torch.randn(seen.shape, generator=rng)}, states.shape[:-1])
 
@@ -80,15 +80,15 @@ def make_filter(
     radius: float | None,
     learn_noise: bool = False,
 ) -> DEnKF:
-    """An ensemble Kalman filter of the system with a wrong forcing.
+    """Returns an ensemble Kalman filter of the system with a wrong forcing.
 
     Args:
         variables: N.
         every: one variable in so many is observed.
         ensemble_size: E.
-        climate: mean and standard deviation of one variable, for those that are not observed at the start.
+        climate: mean and standard deviation of one variable, for the initial belief of unobserved variables.
         radius: of the taper, see :func:`tapers`; ``None`` for none.
-        learn_noise: whether the model noise is a parameter, one variance a variable, and wrong at first.
+        learn_noise: whether the model noise is a parameter with one variance per variable, from a wrong start.
     """
     dims = list(range(0, variables, every))
     noise = ConstantNoise(
@@ -113,27 +113,27 @@ def make_filter(
 
 
 def climate_of(record: TensorDict) -> tuple[float, float]:
-    """Mean and standard deviation of a variable, from observations: their variance is the system's plus R."""
+    """Returns mean and standard deviation of a variable, from observations whose variance includes R."""
     observation = record["observation"]
     return observation.mean().item(), (observation.var().item() - R**2) ** 0.5
 
 
 def forcing_of(denkf: DEnKF) -> torch.Tensor:
-    """The parameter F."""
+    """Returns the parameter F."""
     return denkf["transition"].module["transition"].module.forcing
 
 
 def noise_of(denkf: DEnKF) -> torch.Tensor:
-    """Standard deviation of the model noise of each variable."""
+    """Returns the standard deviation of the model noise of each variable."""
     return (0.5 * denkf["transition"].module["noise"].log_variance).exp().detach()
 
 
 def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, rate: float = 0.1) -> None:
     """Maximises the likelihood on windows of the ``record`` ``[records, steps]``, in place.
 
-    A window begins with the belief that the present filter has after a warm-up from the window's first
-    observation: the start knows less than the filter does later, and its likelihood says little about F. The choice
-    of the windows is ``rng``'s, the noise of the filter torch's own.
+    A window begins with the belief of the present filter after a warm-up from the window's first observation, because
+    the likelihood under the wide initial belief has little information about F. ``rng`` draws the windows, and torch's
+    global generator the noise of the filter.
     """
     loss = DEnKFLoss.ad_enkf(denkf, detach_every=10)
 
@@ -145,7 +145,7 @@ def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, 
         with torch.no_grad():
             warm = denkf.sequence(frames[:, : WARM_UP + 1].copy()).select(*denkf.belief_keys)
         frames = frames[:, WARM_UP:].copy()
-        # A stored belief needs an entry for every time; only the first is read, as nothing starts anew in between.
+        # A stored belief needs an entry for every time; only the first is read, because there is no reset in between.
         frames.update(warm[:, -1:].expand(BATCH, WINDOW + 1))
         return loss(frames)["loss_nll"]
 
@@ -155,6 +155,6 @@ def learn(denkf: DEnKF, record: TensorDict, updates: int, rng: torch.Generator, 
 
 @torch.no_grad()
 def evaluate(denkf: DEnKF, states: torch.Tensor, record: TensorDict, skip: int) -> float:
-    """Root mean square error of the belief's mean on an unseen record; here alone the true states are used."""
+    """Returns the RMSE of the belief's mean on an unseen record, whose true states no training uses."""
     mean = denkf.sequence(record.copy())["belief", "mean"]
     return (mean - states)[:, skip:].square().mean().sqrt().item()

@@ -1,1 +1,1 @@
-"""Tells how many members an ensemble needs."""
+"""Measures the error of ensembles of different sizes."""

@@ -1,4 +1,4 @@
-"""Balanced dropout masks against independent ones, in the reacher's filter: ``python -m benchmarks.members.masks``."""
+"""Compares balanced with random dropout masks in the reacher's filter: ``python -m benchmarks.members.masks``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MASKS = ("random", "balanced")
 
 @dataclass(frozen=True)
 class Masks:
-    """Compares balanced and random dropout masks in the library's filter whose noise is dropout."""
+    """Compares balanced and random dropout masks in the reacher's filter."""
 
     out: Path | None = None  # folder for masks.md
     members: tuple[int, ...] = (32, 64, 128, 256, 512)
@@ -34,7 +34,7 @@ def main() -> None:
         f"{study.draws} draws of the noise, and share of the truth within the 90 % intervals. No localisation. Weights "
         "are the same.",
         "",
-        *head("task", "members", *(word for masks in MASKS for word in (f"{masks} masks", "held"))),
+        *head("task", "members", *(word for masks in MASKS for word in (f"{masks} masks", "coverage"))),
     ]
     for members in study.members:
         cells = []

@@ -1,4 +1,4 @@
-"""The study: its options, its rows, its table and picture."""
+"""The study: its options, its rows, its table and plot."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ TITLES = {"walks": "ten walks", "lorenz96": "Lorenz-96", "ur5": "UR5 arm"}  # ot
 
 @dataclass(frozen=True)
 class Study:
-    """Tells how many members an ensemble needs, with and without localisation by significance."""
+    """Measures the error of different ensemble sizes, with and without localisation by significance."""
 
-    out: Path | None = None  # folder for members.csv, members.md and members.png; rows that are there stay
-    runs: Path = Path("runs/members")  # demos of the UR5 and the trained motion of the manipulator, made where missing
+    out: Path | None = None  # folder for members.csv, members.md and members.png; finished rows stay
+    runs: Path = Path("runs/members")  # demos of the UR5 and trained motion of the manipulator, made if missing
     members: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
-    thresholds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0)  # of which validation data choose one
+    thresholds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0)  # candidates, from which validation data choose
     tasks: tuple[str, ...] = ("walks", "reacher", "cartpole", "manipulator", "lorenz96", "wheels", "ur5")
     smoke: bool = False  # two small tasks: do they run?
 
 
 def made(study: Study, name: str) -> Task:
-    """A task with its data."""
+    """Returns a task with its data."""
     if name == "walks":
         return tasks.walks(*((2, 20) if study.smoke else ()))
     if name == "lorenz96":
@@ -45,7 +45,7 @@ def made(study: Study, name: str) -> Task:
 
 
 def rows_of(task: Task, study: Study, there: list[dict]) -> Iterator[dict]:
-    """Rows of a task that are not there yet."""
+    """Yields the missing rows of a task."""
     if task.reference is not None:
         name, score = task.reference
         if not pick(there, task=task.name, filter=name):
@@ -65,21 +65,21 @@ def rows_of(task: Task, study: Study, there: list[dict]) -> Iterator[dict]:
 
 
 def chosen(task: Task, study: Study, members: int) -> float | None:
-    """The threshold with the least error on validation data; ``None`` where members are too few for any."""
+    """Returns the threshold with the least error on validation data; ``None`` if there are too few members."""
     able = [threshold for threshold in study.thresholds if threshold**2 < members - 1]
     scores: dict[float, Score] = {threshold: task.validate(members, threshold) for threshold in able}
     return min(scores, key=lambda threshold: scores[threshold].error) if scores else None
 
 
 def page(rows: list[dict], study: Study) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
         "# How many members?",
         "",
         'Error, and share of the truth within the 90 % intervals, without and with `localisation="significance"`.',
         "Validation data of the same kind choose the threshold, and of Lorenz-96 the inflation.",
         "",
-        *head("task", "error", "members", "without", "held", "with", "held", "threshold"),
+        *head("task", "error", "members", "without", "coverage", "with", "coverage", "threshold"),
     ]
     for name in tasks.ERRORS:
         own = pick(rows, task=name)
@@ -97,12 +97,12 @@ def page(rows: list[dict], study: Study) -> str:
 
 
 def cells(row: dict) -> tuple[str, str]:
-    """Error and coverage; empty where there is no row."""
+    """Returns error and coverage, empty without a row."""
     return (f"{row['error']:.3g}", f"{row['held']:.0%}") if row else ("", "")
 
 
 def draw(rows: list[dict], file: Path) -> None:
-    """Errors at the left, coverage at the right, against the members; a row a task."""
+    """Draws error (left) and coverage (right) against ensemble size, a row for each task."""
     names = [name for name in tasks.ERRORS if pick(rows, task=name)]
     size = (7.5, 1.9 * len(names))
     figure, axes = plt.subplots(len(names), 2, figsize=size, sharex=True, squeeze=False, layout="constrained")

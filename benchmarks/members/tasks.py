@@ -1,4 +1,4 @@
-"""The tasks: each makes data once, and gives the error and the coverage of a filter with any number of members."""
+"""The tasks: each makes data once, and scores filters with any number of members."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from torch_denkf.metrics import interval_coverage
 from torch_denkf.modules import ConstantNoise, EnsembleAnalysis, GaussianPrior, LearnedTransition, Select
 
 LEVEL = 0.9  # of the intervals
-#: What the error of each task is of, with the unit.
+#: Error of each task, with its unit.
 ERRORS = {
     "walks": "error of the walks",
     "reacher": "velocities, rad/s",
@@ -38,12 +38,12 @@ ERRORS = {
     "wheels": "place, m",
     "ur5": "joints, degrees",
 }
-WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # walks, each step of one, each reading of one
+WALKS, WALK_STD, READING_STD = 10, 0.1, 0.5  # number of walks, standard deviations of a step and of a reading
 
 
 @dataclass(frozen=True)
 class Score:
-    """Tells how good a filter is: its error in the task's unit, and the share of the truth in its 90 % intervals."""
+    """Error of a filter in the task's unit, and coverage of its 90 % intervals."""
 
     error: float
     held: float
@@ -55,9 +55,9 @@ class Task:
 
     Attributes:
         name: of the task.
-        make: returns a filter with so many members, and the threshold of the significance or ``None``.
-        test: scores such a filter from a seed.
-        validation: the same on other data, by which the threshold is chosen.
+        make: returns a filter from its number of members, and the threshold of the significance or ``None``.
+        test: scores such a filter with a seed.
+        validation: the same on validation data, by which the threshold is chosen.
         reference: name and score of a filter without members; ``None`` for none.
     """
 
@@ -77,12 +77,12 @@ class Task:
 
 
 def localised(threshold: float | None) -> dict[str, Any]:
-    """The options of an analysis."""
+    """Returns the options of an analysis."""
     return {} if threshold is None else {"localisation": "significance", "threshold": threshold}
 
 
 def scored(mean: Tensor, var: Tensor, truth: Tensor, dims: slice = slice(None)) -> Score:
-    """Root mean square error of some components, coverage of all, over ``[*B, S]``."""
+    """Returns the root mean square error of some components ``dims``, and the coverage of all, over ``[*B, S]``."""
     parts = [value.flatten(0, -2) for value in (mean, var, truth)]
     error = (parts[0] - parts[2])[:, dims].square().mean().sqrt()
     return Score(float(error), float(interval_coverage(*parts, level=LEVEL).mean()))
@@ -90,14 +90,14 @@ def scored(mean: Tensor, var: Tensor, truth: Tensor, dims: slice = slice(None)) 
 
 @torch.no_grad()
 def filtered(filter: Filter, seed: int, data: TensorDict, skip: int, dims: slice = slice(None)) -> Score:
-    """The score on sequences ``[B, T]`` behind their first steps."""
+    """Returns the score on sequences ``[B, T]`` without their first steps."""
     torch.manual_seed(seed)
     out = filter.sequence(data.clone(), keep=[("belief", "mean"), ("belief", "var")])["belief"][:, skip:]
     return scored(out["mean"], out["var"], data["state"][:, skip:], dims)
 
 
 def wheels(runs: int = 8, steps: int = 6000) -> Task:
-    """The robot on wheels of ``benchmarks.wheels``: fast sensors, slow GPS."""
+    """Returns the robot on wheels of ``benchmarks.wheels``: fast sensors, slow GPS."""
     test, other = recordings(runs, steps, 0), recordings(runs, steps, 1)
     scores = [partial(filtered, data=data, skip=min(500, steps // 2), dims=slice(0, 2)) for data in (test, other)]
 
@@ -117,7 +117,7 @@ def _walks(runs: int, steps: int, seed: int) -> TensorDict:
 
 
 def walks(runs: int = 16, steps: int = 1000) -> Task:
-    """Ten random walks that have nothing to do with each other, one of which is read at each step."""
+    """Returns the task of ten independent random walks, one of which is read at each step."""
     test, other = _walks(runs, steps, 0), _walks(runs, steps, 1)
     scores = [partial(filtered, data=data, skip=min(100, steps // 2)) for data in (test, other)]
     eye = torch.eye(WALKS)
@@ -141,7 +141,7 @@ def walks(runs: int = 16, steps: int = 1000) -> Task:
 
 
 def _weather(seeds: int, cycles: int, first: int) -> tuple[Tensor, Tensor]:
-    """True states and readings of Lorenz-96, ``[cycles + 1, seeds, 40]``."""
+    """Returns true states and readings of Lorenz-96, ``[cycles + 1, seeds, 40]``."""
     generator = torch.Generator().manual_seed(first)
     draw = partial(torch.randn, seeds, 40, generator=generator, dtype=torch.float64)
     state = 8 + draw()
@@ -154,7 +154,7 @@ def _weather(seeds: int, cycles: int, first: int) -> tuple[Tensor, Tensor]:
 
 
 def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = (1.0, 1.02, 1.05, 1.1)) -> Task:
-    """Forty variables, all read in each cycle, R = 1, no localisation by places; the inflation is chosen, too."""
+    """Returns the task of Lorenz-96 with R = 1 and all variables read in each cycle; validation picks inflation."""
     data = {"validation": _weather(seeds, cycles, 1), "test": _weather(seeds, cycles, 0)}
     chosen: dict[tuple[int, float | None], int] = {}
 
@@ -166,7 +166,7 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
         ensemble = (truth[0].unsqueeze(1) + start).repeat(len(inflations), 1, 1)
         noise, found = torch.ones_like(ensemble[:, 0]), []
         for reading in readings[1:]:
-            ensemble = lorenz96_step(ensemble).clamp(-50, 50)  # one that diverged is to stay finite
+            ensemble = lorenz96_step(ensemble).clamp(-50, 50)  # keeps diverged members finite
             reading = reading.repeat(len(inflations), 1)
             options: dict[str, Any] = {"scheme": "etkf", "significance": threshold}
             ensemble = inflate(analyse(ensemble, ensemble, reading, noise, **options).ensemble, factor)
@@ -196,9 +196,9 @@ def lorenz96(seeds: int = 4, cycles: int = 600, inflations: tuple[float, ...] = 
 
 
 def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
-    """Joint velocities of dm_control's manipulator by the filter of ``benchmarks.arms``, which learned its motion.
+    """Returns the task of the joint velocities of dm_control's manipulator, with the filter of ``benchmarks.arms``.
 
-    Cosine, sine and velocity of its joints are 12 numbers, of which noisy encoders read 8.
+    Its state has dimension 12 (cosine, sine and velocity of each joint), of which noisy encoders read 8.
     """
     arm = ARMS["manipulator"]
     shipped = trained(arm, False, Study(demos=demos, motion_updates=updates), folder)
@@ -213,7 +213,7 @@ def manipulator(folder: Path, demos: int = 100, updates: int = 8000) -> Task:
 
 
 def localise(filter: Filter, threshold: float | None) -> Filter:
-    """Switches significance on or off in a filter that is there; returns it."""
+    """Switches significance on or off in a filter, in place, and returns it."""
     for module in filter.modules():
         if isinstance(module, EnsembleAnalysis):
             module.localisation, module.threshold = (None, 3.0) if threshold is None else ("significance", threshold)
@@ -221,14 +221,14 @@ def localise(filter: Filter, threshold: float | None) -> Filter:
 
 
 def resized(filter: Any, members: int, threshold: float | None) -> Any:
-    """A filter that comes with the library, with so many members; their noise models stay those of its training."""
+    """Returns a pretrained filter with another number of members and the noise models of its training."""
     new = type(filter)(replace(filter.settings, ensemble_size=members))
     new.load_state_dict(filter.state_dict())
     return localise(new.eval(), threshold)
 
 
 def reacher(episodes: int = 10, steps: int = 400) -> Task:
-    """Joint velocities of the reacher by the filter that comes with the library, under random actions."""
+    """Returns the task of the reacher's joint velocities under random actions, with the pretrained filter."""
     scores = []
     for seed in (1000, 2000):
         torch.manual_seed(seed)
@@ -245,7 +245,7 @@ def _pushes(noise: float, episodes: int, seed: int) -> TensorDict:
 
 
 def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
-    """Velocities of the cartpole of ``benchmarks.control`` under random pushes, by a filter that knows its physics."""
+    """Returns the task of the cartpole's velocities under random actions, with a filter that has its physics."""
     data = [_pushes(noise, episodes, seed) for seed in (0, 1)]
 
     def make(members: int, threshold: float | None) -> Filter:
@@ -255,7 +255,7 @@ def cartpole(noise: float = 0.3, episodes: int = 20) -> Task:
 
 
 def ur5(folder: Path, demos: int = 200, others: int = 100) -> Task:
-    """Joints of the UR5 at its table by the filter that comes with the library, on demos that it has not seen."""
+    """Returns the task of the UR5's joints at its table, with the pretrained filter."""
     side = UR5TableSettings.pixels
     collect_ur5_demos(folder / "test", demos, size=(side, side), seed=0)
     collect_ur5_demos(folder / "validation", others, size=(side, side), seed=1)

@@ -1,7 +1,7 @@
 """Compares thresholds of the significance, and none: ``python -m benchmarks.members.thresholds``.
 
-Small tasks, all noise drawn exactly: the walks and the robot on wheels of this study, a target of which bearings alone
-are read, and linear systems of 20 and 27 components, more than 16 members can tell. Validation data alone are scored.
+Small tasks with exact draws: the walks and the robot on wheels of this study, a target with only bearings, and linear
+systems of 20 and 27 components, more than the rank of 16 members. Only validation data are scored.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torch_denkf.modules import (
 )
 
 MEAN, STD = [0.0, 6.0, 0.0, 0.0, 0.0], [2.0, 1.5, 0.12, 0.12, 0.06]  # of the target at the start
-WALK, BEARING = [0.0, 0.0, 0.003, 0.003, 0.033], 0.02  # process noise of a step; of a bearing, rad
+WALK, BEARING = [0.0, 0.0, 0.003, 0.003, 0.033], 0.02  # standard deviations of process noise and of a bearing, rad
 
 
 @dataclass(frozen=True)
@@ -46,26 +46,26 @@ class Study:
 
 
 def turned(state: Tensor) -> Tensor:
-    """Targets ``[*, 5]``, place, speeds and turn rate, one step later."""
+    """Returns targets ``[*, 5]``, place, speeds and turn rate, one step later."""
     x, y, vx, vy, turn = state.unbind(-1)
     vx, vy = turn.cos() * vx - turn.sin() * vy, turn.sin() * vx + turn.cos() * vy
     return torch.stack([x + vx, y + vy, vx, vy, 0.95 * turn], -1)
 
 
 class Bearing(SubModel):
-    """The angle under which an observer, at an entry ``"observer"`` ``[*B, 2]``, sees the members."""
+    """Measurement model of the bearing from an observer, at the entry ``"observer"`` ``[*B, 2]``."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "observer"], [("forecast", "observation")])
 
     def compute(self, ensemble, observer):
-        """The bearings ``[*B, E, 1]``."""
+        """Returns the bearings ``[*B, E, 1]``."""
         away = ensemble[..., :2] - observer.unsqueeze(-2)
         return torch.atan2(away[..., :1], away[..., 1:])
 
 
 def targets(runs: int, seed: int, steps: int = 40) -> TensorDict:
-    """Targets with rare turns, an observer that weaves, and bearings."""
+    """Returns targets with rare turns, a weaving observer, and bearings."""
     generator = torch.Generator().manual_seed(seed)
     draw, time = partial(torch.randn, generator=generator), torch.arange(steps)
     state, states = torch.tensor(MEAN) + torch.tensor(STD) * draw(runs, 5), []
@@ -86,7 +86,7 @@ def targets(runs: int, seed: int, steps: int = 40) -> TensorDict:
 
 @torch.no_grad()
 def bearings(runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
-    """The unscented Kalman filter's score, and an ensemble's: the median error of a run, a mean over components."""
+    """Returns the UKF's score and a scorer of ensembles: median over runs, geometric mean over components."""
     data = targets(runs, 4)
     common = {"process_noise": WALK, "update_at_reset": True}
     reading = {"reading_space": Circle(), "observation_key": "reading"}
@@ -109,7 +109,7 @@ def bearings(runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
 
 
 def linear(size: int, read: int, runs: int) -> tuple[Score, Callable[[int, float | None], Score]]:
-    """The Kalman filter's score on a random stable system, and an ensemble's."""
+    """Returns the Kalman filter's score on a random stable system, and a scorer of ensembles."""
     generator = torch.Generator().manual_seed(size)
     draw = partial(torch.randn, generator=generator)
     f, h = 0.98 * torch.linalg.qr(draw(size, size))[0], draw(read, size) / size**0.5
@@ -154,7 +154,7 @@ def main() -> None:
     }
     for name, task in others.items():
         tasks[name] = task.validate(8 if small else 512, None), task.validate
-    lines = ["# Which threshold?", "", *head("task", "members", "none", *study.thresholds)]
+    lines = ["# Threshold of significance", "", *head("task", "members", "none", *study.thresholds)]
     for name, (reference, score) in tasks.items():
         for members in (8,) if small else study.members:
             able = [one for one in study.thresholds if one**2 < members - 1]

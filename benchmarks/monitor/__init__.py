@@ -1,1 +1,1 @@
-"""Faults that nobody announces: how soon a monitor tells, and what a gate makes of them."""
+"""Unannounced faults: detection delay of a monitor, and errors with a gate."""

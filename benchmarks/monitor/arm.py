@@ -1,4 +1,4 @@
-"""The UR5 at its table, watched by a camera and by noisy encoders, of which one fails without a word."""
+"""The UR5 at its table with a camera and noisy encoders, one of which fails silently."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from torch_denkf.pretrained import from_pretrained
 JOINTS, STEPS = 7, 320
 ENCODER = 0.01  # rad: noise of the encoders
 FIRST, LAST = 120, 180  # steps of a fault
-OWN, OWN_SEED = 70, 1  # demos of the study's own, and what makes them others than those of the training
-MOVED = 0.005  # share of white: a pixel that changes by more than one grey level of 255
+OWN, OWN_SEED = 70, 1  # number of the study's demos, and their seed, which differs from the training's
+MOVED = 0.005  # share of white: a change of a pixel by more than one grey level of 255
 FAULTS = ("camera pushed", "encoder slipped")
 
 
 @dataclass(frozen=True)
 class ArmGuard:
-    """Holds what is chosen on validation demos, see :mod:`benchmarks.monitor.choice`.
+    """Settings that are chosen on validation demos, see :mod:`benchmarks.monitor.choice`.
 
     Attributes:
-        rate: false alarms a step that the monitor is calibrated for, before the margin.
+        rate: false alarms per step that the monitor is calibrated for, before the margin.
         margin: factor on its limits.
         reference: of its cumulative sums.
         gate_margin: factor on the gates' limits.
@@ -49,13 +49,13 @@ CHOSEN = ArmGuard()
 
 
 class Beliefs(NamedTuple):
-    """Demos of the study's own.
+    """Readings and beliefs of the study's own demos.
 
     Attributes:
-        known: clean readings that calibrate.
-        clean: the filter's beliefs of them.
+        known: clean readings for calibration.
+        clean: the filter's beliefs on them.
         tested: readings of other demos, by fault.
-        plain: the filter's beliefs of those.
+        plain: the filter's beliefs on those.
     """
 
     known: TensorDict
@@ -65,7 +65,7 @@ class Beliefs(NamedTuple):
 
 
 def arm_filter() -> Filter:
-    """The trained filter behind its camera, with a second update by the encoders of all joints."""
+    """Returns the trained filter without its camera sensor, with a second update by the encoders of all joints."""
     model = from_pretrained("ur5-table")
     parts = {name: model[name] for name in model.module if name != "sensor"}
     parts["analysis"] = EnsembleAnalysis("sensor", inflation=model.inflation, belief_prefix="seen")
@@ -82,7 +82,7 @@ def arm_filter() -> Filter:
 
 
 def arm_sensors() -> dict[str, MonitoredSensor]:
-    """Returns what to watch."""
+    """Returns the monitored sensors."""
     return {
         "camera": MonitoredSensor(
             ("info", "analysis"), 10, noise_key=("sensor", "noise"), sign_key="moved", signs=1, floor=MOVED
@@ -93,7 +93,7 @@ def arm_sensors() -> dict[str, MonitoredSensor]:
 
 @torch.no_grad()
 def read_demos(folder: Path, split: str, fault: str, cache: Path) -> TensorDict:
-    """Returns what camera and encoders read of whole demos ``[N, T]``, with ``"fault"`` ``[N, T, 1]``."""
+    """Returns readings of camera and encoders in whole demos ``[N, T]``, with ``"fault"`` ``[N, T, 1]``."""
     model = from_pretrained("ur5-table")
     data = UR5ExperienceReplay(folder, split=split, cache=cache, progress=False)
     generator, demos = torch.Generator().manual_seed(0), []
@@ -106,7 +106,7 @@ def read_demos(folder: Path, split: str, fault: str, cache: Path) -> TensorDict:
             demo["pixels"][FIRST:LAST] = pushed(demo["pixels"][FIRST:LAST], number)
         elif fault == "encoder slipped":
             demo["encoder"][FIRST:LAST, number % 6] += 0.1 if number % 2 else -0.1  # rad
-        # The camera stands, and so does most of what it sees: three pixels in four keep their value from the start.
+        # Camera and background are fixed, so that three pixels in four keep their value from the start.
         change = (demo["pixels"] - demo["pixels"][:1]).abs().amax(1).flatten(1)
         demo["moved"] = change.quantile(0.75, dim=1, keepdim=True)
         with torch.random.fork_rng(devices=[]):
@@ -117,27 +117,27 @@ def read_demos(folder: Path, split: str, fault: str, cache: Path) -> TensorDict:
 
 
 def pushed(pictures: Tensor, number: int) -> Tensor:
-    """Pictures ``[T, 3, H, W]`` of a camera that was pushed: 8 % to one side, and turned by 5 degrees."""
+    """Returns images ``[T, 3, H, W]`` of a camera that was pushed: 8 % to one side, and turned by 5 degrees."""
     side = 1.0 if number % 2 else -1.0
-    turn, way = torch.tensor(side * 5.0).deg2rad(), 2 * side * 0.08  # the picture's coordinates reach from -1 to 1
+    turn, way = torch.tensor(side * 5.0).deg2rad(), 2 * side * 0.08  # the image's coordinates reach from -1 to 1
     matrix = torch.tensor([[turn.cos(), -turn.sin(), way], [turn.sin(), turn.cos(), 0.0]]).expand(len(pictures), 2, 3)
     grid = affine_grid(matrix, list(pictures.shape), align_corners=False)
     return grid_sample(pictures, grid, padding_mode="border", align_corners=False)
 
 
 def error_of(out: TensorDict) -> Tensor:
-    """Error of the belief's mean in units of what counts as one, mean over the state, ``[N, T]``."""
+    """Returns the error of the belief's mean in units ``UNIT``, averaged over the state, ``[N, T]``."""
     return ((out["belief", "mean"] - out["state"]).abs() / UNIT).mean(-1)
 
 
 def own_demos(out: Path, count: int = OWN) -> Path:
-    """The folder of demos that neither trained nor test anything; collects what is missing."""
+    """Returns the folder of demos outside of training and test; collects the missing ones."""
     collect_ur5_demos(out / "ur5", count, size=(64, 64), frames=0, seed=OWN_SEED)
     return out / "ur5"
 
 
 def chosen_on(folder: Path, cache: Path) -> Beliefs:
-    """Own demos: a third calibrates, the others have the faults."""
+    """Returns readings and beliefs of own demos: a third for calibration, the others with the faults."""
     model = arm_filter()
     tested = {fault: read_demos(folder, "all", fault, cache) for fault in ("none", *FAULTS)}
     third = max(len(tested["none"]) // 3, 1)
@@ -148,25 +148,25 @@ def chosen_on(folder: Path, cache: Path) -> Beliefs:
 
 
 def arm_monitor(clean: TensorDict, guard: ArmGuard = CHOSEN) -> InnovationMonitor:
-    """A monitor, calibrated on beliefs of clean demos."""
+    """Returns a monitor, calibrated on beliefs of clean demos."""
     options = {"window": 3, "reference": guard.reference, "false_alarm_rate": guard.rate}
     return InnovationMonitor(arm_sensors(), **options).calibrate([clean], margin=guard.margin)
 
 
 def arm_gate(known: TensorDict, guard: ArmGuard = CHOSEN) -> Filter:
-    """The filter with two gates, calibrated on clean readings."""
+    """Returns the filter with two gates, calibrated on clean readings."""
     gate = Gated(arm_filter(), 10, places=["analysis"], response="reject", rate=1e-4, patience=10)
     gate = Gated(gate, JOINTS, places=["encoders"], response="reject", rate=1e-4, patience=100, by_component=True)
     return gate.calibrate([known], margin=guard.gate_margin)
 
 
 def demo_runs(monitor: InnovationMonitor, beliefs: dict[str, TensorDict]) -> dict[str, list[Run]]:
-    """Returns what the monitor says, by fault."""
+    """Returns the monitor's output by fault."""
     return {fault: runs_of(monitor, each) for fault, each in beliefs.items()}
 
 
 def gated_errors(beliefs: Beliefs, guard: ArmGuard) -> dict[str, float]:
-    """Mean error with the gate by fault: of a fault, while it lasts."""
+    """Returns the mean error with the gate by fault, over the steps of the fault."""
     gate, out = arm_gate(beliefs.known, guard), {}
     for fault, data in beliefs.tested.items():
         rows = slice(1, None) if fault == "none" else data["fault"][0, :, 0]
@@ -175,7 +175,7 @@ def gated_errors(beliefs: Beliefs, guard: ArmGuard) -> dict[str, float]:
 
 
 def arm_rows(folder: Path, own: Path, cache: Path, draws: int) -> list[dict]:
-    """A row for each fault, over the demos of the test side; thresholds from the study's own demos."""
+    """Returns a row for each fault, over the test demos; the limits come from the study's own demos."""
     model = arm_filter()
     known = read_demos(own, "all", "none", cache)
     tested = {fault: read_demos(folder, "test", fault, cache) for fault in ("none", *FAULTS)}
@@ -195,13 +195,13 @@ def arm_rows(folder: Path, own: Path, cache: Path, draws: int) -> list[dict]:
 
 @torch.no_grad()
 def believe(model: Filter, demos: TensorDict, draws: int, seed: int = 0) -> TensorDict:
-    """Beliefs on demos ``[N, T]``, each so many times, ``[draws N, T]``."""
+    """Returns beliefs on demos ``[N, T]``, repeated ``draws`` times, ``[draws N, T]``."""
     torch.manual_seed(seed)
     return model.sequence(torch.cat([demos] * draws).clone())
 
 
 def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
-    """Returns what a monitor says of beliefs ``[N, T]``."""
+    """Returns a monitor's output on beliefs ``[N, T]``."""
     said = monitor.replay(beliefs)["monitor"]
     evidence = torch.maximum(said["camera", "evidence"], said["encoders", "evidence"])
     parts = (evidence, said["alarm"], beliefs["fault"])
@@ -209,6 +209,6 @@ def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
 
 
 def errors(plain: TensorDict, gated: TensorDict, during: Tensor | None = None) -> dict[str, float]:
-    """Mean errors of the filter and of the gated one, over the steps ``[T]`` that are marked."""
+    """Returns the mean errors of the filter and of the gated filter, over the steps of the mask ``[T]``."""
     rows = slice(1, None) if during is None else during
     return {"error": float(error_of(plain)[:, rows].mean()), "error_gated": float(error_of(gated)[:, rows].mean())}

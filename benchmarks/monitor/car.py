@@ -21,16 +21,16 @@ from torch_denkf.applications.car.vision.signs import FLOW_SIGNS, PICTURE_SIGNS
 from torch_denkf.metrics import interval_coverage
 from torch_denkf.monitoring import InnovationMonitor, MonitoredSensor, SignGate
 
-#: Up to half of a picture may be sun or shadow, and one brighter than the last by two thirds; 1 % may be any smear.
+#: Floors of the limits: half of an image may be sun or shadow, brightness may rise by two thirds, 1 % may be a smear.
 FLOOR = (0.01, 0.5, 0.5, 0.5, 0.0, 0.0)
 PICTURES = len(PICTURE_SIGNS)
-BLIND = slice(1, PICTURES)  # behind what is static the flow is continued; such a picture is not blind
-MOVING = 2.0  # m/s: slower cars tell nothing of a scale
+BLIND = slice(1, PICTURES)  # signs that reject an image: not the first, as flow in static regions is extrapolated
+MOVING = 2.0  # m/s: lower speeds are not used to estimate the scale
 
 
 @dataclass(frozen=True)
 class CarGuard:
-    """Holds what is chosen on validation drives, see :mod:`benchmarks.monitor.choice`.
+    """Settings that are chosen on validation drives, see :mod:`benchmarks.monitor.choice`.
 
     Attributes:
         rate: share of the clean readings whose speed is taken from the flow, because it contradicts the road.
@@ -47,12 +47,12 @@ CHOSEN = CarGuard()
 
 
 class CarGates(NamedTuple):
-    """Holds what answers to signs.
+    """Responses to signs.
 
     Attributes:
-        pictures: takes out readings by what their pictures show.
-        flow: finds readings that the flow contradicts.
-        scale: factor on the distance by the flow, which makes it the sensor's.
+        pictures: rejects readings by the signs of their images.
+        flow: detects readings that the flow contradicts.
+        scale: factor from the distance by the flow to that of the sensor.
     """
 
     pictures: SignGate
@@ -60,14 +60,14 @@ class CarGates(NamedTuple):
     scale: float
 
     def seen(self, reading: TensorDict) -> Tensor:
-        """Tells which readings the pictures leave, ``[N, 1]``."""
+        """Returns the observed mask after rejection by the images' signs, ``[N, 1]``."""
         signs = TensorDict({"signs": reading["signs"][:, BLIND], "observed": reading["observed"]}, [len(reading)])
         return self.pictures(signs)["seen"]
 
     def answered(self, reading: TensorDict) -> TensorDict:
-        """The reading without what its pictures speak against.
+        """Returns the readings without those that their images' signs reject.
 
-        Where the flow contradicts the road, the speed is that of the flow.
+        If the flow contradicts the road, the speed is that of the flow.
         """
         out, signs = reading.copy().set("observed", self.seen(reading)), reading["signs"]
         second = ~self.flow(TensorDict({"signs": signs[:, PICTURES:]}, [len(signs)]))["seen"]
@@ -79,7 +79,7 @@ class CarGates(NamedTuple):
 
 
 def monitor_of(beliefs: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> InnovationMonitor:
-    """A monitor, calibrated on beliefs of clean drives."""
+    """Returns a monitor, calibrated on beliefs of clean drives."""
     sensor = MonitoredSensor(
         "info", 2, ("forecast", "observed"), ("sensor", "noise"), sign_key="signs", signs=len(SIGNS), floor=FLOOR
     )
@@ -88,7 +88,7 @@ def monitor_of(beliefs: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> Innov
 
 
 def gates_of(readings: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> CarGates:
-    """Gates, calibrated on clean readings."""
+    """Returns the gates, calibrated on clean readings."""
     signs = [TensorDict({"signs": each["signs"][1:]}, [len(each) - 1]) for each in readings]
     pictures = SignGate(PICTURES - 1, rate=1e-3, floor=FLOOR[BLIND])
     pictures.calibrate([TensorDict({"signs": each["signs"][:, BLIND]}, each.batch_size) for each in signs])
@@ -101,7 +101,7 @@ def gates_of(readings: Sequence[TensorDict], guard: CarGuard = CHOSEN) -> CarGat
 
 
 def path_scores(beliefs: TensorDict) -> dict[str, float]:
-    """End point error over 100 steps, and what the 90 % intervals hold, of draws ``[K, N]``."""
+    """Returns end-point error over 100 steps and 90 % coverage of draws ``[K, N]``."""
     window = min(100, beliefs.shape[1] - 1)
     ends = [
         float(kitti_endpoint_error(mean[:, :3].double(), truth[:, :3].double(), window=window).translation)
@@ -115,14 +115,14 @@ def path_scores(beliefs: TensorDict) -> dict[str, float]:
 def drive_rows(
     task: str, root: Path, drives: Sequence[str], calibration: Sequence[TensorDict], cache: Path, draws: int
 ) -> list[dict]:
-    """A row for each fault, over all drives.
+    """Returns a row for each fault, over all drives.
 
     Args:
-        task: ``"kitti-real"``, of whose drives each one's gate is calibrated on the others, because real pictures are
-            of another kind than rendered ones, and its monitor on these, too; or ``"kitti-rendered"``.
+        task: ``"kitti-rendered"``; or ``"kitti-real"``, with gates of each drive calibrated on the other real drives,
+            because real images differ from rendered ones, and monitors on both.
         root: folder in KITTI's layout.
         drives: names.
-        calibration: clean readings of drives that are in no test.
+        calibration: clean readings of rendered drives that are in no test.
         cache: folder of readings.
         draws: of the filter's noise.
     """
@@ -160,7 +160,7 @@ def drive_rows(
     for fault in ALWAYS if task == "kitti-real" else ("box-all",):
         plain = filtered(model, [failing(root, name, fault, cache) for name in drives], draws)
         readings = [failing(root, name, fault, cache, repair=True) for name in drives]
-        if fault == "black-all":  # where the signs speak against a reading, it is read over a longer span
+        if fault == "black-all":  # rejected readings are replaced by those over a longer span
             for place, each in enumerate(gates):
                 longer = [failing(root, drives[place], fault, cache, steps) for steps in (2, 3)]
                 readings[place] = believed_spans([readings[place], *longer], each.seen)
@@ -172,7 +172,7 @@ def drive_rows(
 
 
 def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[str, float]:
-    """Path scores of the filter and of the gated one, means over the drives of at least 100 steps."""
+    """Returns path scores of the filter and of the gated filter, means over the drives of at least 100 steps."""
     out: dict[str, float] = {}
     for suffix, beliefs in (("", plain), ("_gated", gated)):
         scores = [path_scores(each) for each in beliefs if each.shape[1] > 100] or [path_scores(beliefs[0])]
@@ -181,12 +181,12 @@ def compared(plain: Sequence[TensorDict], gated: Sequence[TensorDict]) -> dict[s
 
 
 def runs_of(monitor: InnovationMonitor, beliefs: TensorDict) -> list[Run]:
-    """Returns what the monitor says of beliefs ``[K, N]``."""
+    """Returns the monitor's output on beliefs ``[K, N]``."""
     said = monitor.replay(beliefs)["monitor"]
     parts = (said["camera", "evidence"], said["alarm"], beliefs["fault"])
     return [Run(*row) for row in zip(*(part.squeeze(-1) for part in parts), strict=True)]
 
 
 def velocity_error(beliefs: TensorDict, unit: Tensor) -> Tensor:
-    """Error of speed and turn rate in units of a good sensor's, ``[K, N]``."""
+    """Returns the error of speed and turn rate in units of a good sensor's, ``[K, N]``."""
     return ((beliefs["belief", "mean"] - beliefs["state"])[..., VELOCITIES].abs() / unit).mean(-1)

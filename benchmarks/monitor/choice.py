@@ -1,4 +1,4 @@
-"""Chooses what the study sets by hand, on drives and demos that no test sees."""
+"""Chooses the study's settings on drives and demos that are in no test."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ RATES = (0.005, 0.02, 0.05, 0.1, 0.15, 0.2)
 MARGINS = (1.0, 1.3, 1.6, 2.0)
 REFERENCES = (1.0, 1.5, 2.0)
 ALARM_RATES = (1e-3, 1e-2, 3e-2)  # of the arm's monitor; the margin makes them rarer
-FALSE_ALARMS = 0.5  # in 1,000 steps: half of what is wanted, because tests are other data
+FALSE_ALARMS = 0.5  # in 1,000 steps: half of the target, because test data differ
 
 
 def choose_car(
     calibration: Sequence[TensorDict], validation: dict[str, Sequence[TensorDict]], draws: int
 ) -> tuple[CarGuard, list[dict]]:
-    """Rate of the gate, then margin and reference of the monitor.
+    """Chooses the rate of the gate, then margin and reference of the monitor.
 
     Args:
-        calibration: clean readings of invented drives.
-        validation: readings of other invented drives by fault, ``"clean"`` and ``"box-all, repaired"`` among them.
+        calibration: clean readings of synthetic drives.
+        validation: readings of other synthetic drives by fault, including ``"clean"`` and ``"box-all, repaired"``.
         draws: of the filter's noise.
 
     Returns:
-        What is chosen, and a row for each trial.
+        The chosen settings, and a row for each trial.
     """
     _, model = car_filter()
     guard, rows = CarGuard(), []
     known = filtered(model, calibration)
 
     def guarded(readings: Sequence[TensorDict], guard: CarGuard, left_out: bool = False) -> list[dict[str, float]]:
-        """Path scores; where the drives are those of the calibration, each with a gate from the others."""
+        """Returns the path scores; with ``left_out``, each calibration drive has a gate from the other drives."""
         answered = []
         for place, reading in enumerate(readings):
             others = [each for k, each in enumerate(calibration) if not (left_out and k == place)]
@@ -67,7 +67,7 @@ def choose_car(
 
 
 def choose_arm(beliefs: Beliefs) -> tuple[ArmGuard, list[dict]]:
-    """Margin and reference of the monitor, then the gate's margin; of demos whose first third calibrates."""
+    """Chooses rate, margin and reference of the monitor, then the gate's margin."""
     rows, guard = [], ArmGuard()
     for rate, reference, margin in product(ALARM_RATES, REFERENCES, MARGINS[::2] + MARGINS[-1:]):
         trial = replace(guard, rate=rate, margin=margin, reference=reference)
@@ -85,14 +85,14 @@ def choose_arm(beliefs: Beliefs) -> tuple[ArmGuard, list[dict]]:
 
 
 def _alarms(runs: dict[str, list], sound: str) -> dict[str, float]:
-    """False alarms on sound runs, and the worst AUROC and delay over the faults."""
+    """Returns false alarms on fault-free runs, and the worst AUROC and delay over the faults."""
     found = [detection(part) for fault, part in runs.items() if fault != sound]
     worst = {"auroc": min(each["auroc"] for each in found), "delay_steps": max(each["delay_steps"] for each in found)}
     return {**false_alarms(runs[sound]), **worst}
 
 
 def _best(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of monitors that are quiet enough the one that finds soonest, then most surely; else the quietest."""
+    """Returns the monitor with the shortest delay, then best AUROC, among those with few enough false alarms."""
     quiet = [row for row in rows if row["false_alarms_per_1000"] <= FALSE_ALARMS]
     if not quiet:
         return min(rows, key=lambda row: row["false_alarms_per_1000"])

@@ -1,4 +1,4 @@
-"""Drives whose camera fails without a word: what the trained sensor reads of them."""
+"""Readings of the trained sensor on drives whose camera fails silently."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from torch_denkf.envs import BlackFrames, Brightness, OccludingBox
 from torch_denkf.filters import Filter
 from torch_denkf.pretrained import from_pretrained
 
-LENGTH, PERIOD = 20, 60  # frames that a fault lasts, and between the beginnings of two
+LENGTH, PERIOD = 20, 60  # frames of a fault, and between the beginnings of two faults
 SIGNS = (*PICTURE_SIGNS, *FLOW_SIGNS)
 _IMAGE = {"in_keys": ("image",)}
-#: What happens to the pictures of a stretch.
+#: Faults of the images in some stretches of a drive.
 FAULTS: dict[str, Callable] = {
     "black": partial(BlackFrames, 1.0, **_IMAGE),
     "box": partial(OccludingBox, **_IMAGE),
     "exposure": partial(Brightness, (6.0, 6.0), (0.1, 0.1), **_IMAGE),  # most of the street is white
 }
-#: What happens over a whole drive: three frames in ten are black, or a box hides 5 % of each.
+#: Faults over a whole drive: three frames in ten are black, or a box covers 5 % of each.
 ALWAYS: dict[str, Callable] = {
     "black-all": partial(BlackFrames, 0.3, **_IMAGE),
     "box-all": partial(OccludingBox, **_IMAGE),
@@ -47,27 +47,27 @@ ALWAYS: dict[str, Callable] = {
 
 
 def stretches(frames: int) -> Tensor:
-    """Tells which of so many frames are of a fault, ``[frames]``."""
+    """Returns the mask of the frames with a fault, ``[frames]``."""
     number = torch.arange(frames)
     return (number % PERIOD >= PERIOD - LENGTH) & (number < frames // PERIOD * PERIOD)
 
 
 def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1, *, repair: bool = False) -> TensorDict:
-    """Returns what the trained sensor reads of a whole drive ``[N]``.
+    """Returns the trained sensor's readings of a whole drive ``[N]``.
 
-    ``"fault"`` ``[N, 1]`` says which pairs of pictures are of the fault; ``"signs"`` ``[N, 6]`` are those of ``SIGNS``.
-    The last two, of the flow, are NaN where a plain reading is of the fault, and of pairs of more than one step.
+    ``"fault"`` ``[N, 1]`` masks the pairs of images with the fault; ``"signs"`` ``[N, 6]`` are those of ``SIGNS``.
+    The last two, of the flow, are NaN for unrepaired pairs with the fault, and for pairs of more than one step.
 
     Args:
         root: folder in KITTI's layout.
         name: of the drive.
         fault: ``"clean"``, or of ``FAULTS`` or ``ALWAYS``.
-        cache: folder in which readings are kept.
-        steps: between the two pictures of a pair.
-        repair: whether flow is continued over what stands still before the camera.
+        cache: folder in which readings are cached.
+        steps: between the two images of a pair.
+        repair: whether the flow is extrapolated over static regions of the images.
     """
     entry = f"{name}-{fault}" if steps == 1 else f"{name}-{fault}-{steps}"
-    # What a fault does not touch is that of the clean drive, and what is not repaired that of the plain reading.
+    # Pairs without a fault are copied from the clean drive, and pairs without a repair from the plain reading.
     clean = failing(root, name, "clean", cache) if fault != "clean" and steps == 1 else None
     plain = cached(cache / entry, lambda: _read(root, name, fault, steps, clean, cache)).copy()
     shown = cached(cache / f"{entry}-signs", lambda: _picture_signs(root, name, fault, steps))["signs"]
@@ -88,14 +88,14 @@ def failing(root: Path, name: str, fault: str, cache: Path, steps: int = 1, *, r
 
 
 def _with_signs(reading: TensorDict, shown: Tensor, seen: Tensor) -> TensorDict:
-    """The reading with all signs, with what the flow says ``[N, 2]``."""
+    """Returns the reading with all signs, given distance and road correlation by the flow ``[N, 2]``."""
     distance = reading["sensor", "ensemble"][..., 0].mean(-1) * KITTI_DT
     of_flow = flow_signs(seen[:, 0], seen[:, 1].reshape(-1, 1, 1), distance)
     return reading.update({"signs": torch.cat([shown, of_flow], -1), "by_flow": seen, "plane": seen[:, :1]})
 
 
 def _drive(root: Path, name: str, fault: str, steps: int) -> TensorDict:
-    """The drive with its fault: ``"steps"`` ``[N, 1]`` of a pair, and ``"fault"`` ``[N, 1]``, whether it is in it."""
+    """Returns the drive with its fault: ``"steps"`` ``[N, 1]`` of each frame pair, a mask ``"fault"`` ``[N, 1]``."""
     size = from_pretrained("car-odometry").settings.size
     drive = read_kitti_drive(root, name, size=size, colour=False, cache=None).copy()
     image, hit = drive["image"].clone(), torch.zeros(len(drive), dtype=torch.bool)
@@ -116,7 +116,7 @@ def _drive(root: Path, name: str, fault: str, steps: int) -> TensorDict:
 
 
 def _picture_signs(root: Path, name: str, fault: str, steps: int) -> TensorDict:
-    """Signs of a failing camera ``[N, 4]``."""
+    """Returns the image signs of a failing camera ``[N, 4]``."""
     drive = _drive(root, name, fault, steps)
     images, out = drive["image"][:, 0].numpy(), torch.zeros(len(drive), len(PICTURE_SIGNS))
     for row in drive["steps"].squeeze(-1).nonzero().flatten().tolist():
@@ -125,7 +125,7 @@ def _picture_signs(root: Path, name: str, fault: str, steps: int) -> TensorDict:
 
 
 def _by_flow(root: Path, name: str, fault: str, known: TensorDict | None, cache: Path) -> TensorDict:
-    """Distance by the flow, and the road's correlation, ``[N, 2]``, of what is repaired if more is known."""
+    """Returns distance by the flow and road correlation, ``[N, 2]``, after the repair if one is possible."""
     motion = _motion(root, name, fault, 1, known, cache, repair=known is not None)
     values = torch.stack([plane_distance(motion["flow"].float()), motion["road"].float().amax((1, 2))], -1)
     return TensorDict({"by_flow": torch.where(motion["steps"] > 0, values, torch.nan)}, [len(motion)])
@@ -134,19 +134,19 @@ def _by_flow(root: Path, name: str, fault: str, known: TensorDict | None, cache:
 def _motion(
     root: Path, name: str, fault: str, steps: int, known: TensorDict | None, cache: Path, *, repair: bool
 ) -> TensorDict:
-    """Flow and road of the pairs that are not known."""
+    """Returns flow and road of the pairs that are not in ``known``."""
     drive = _drive(root, name, fault, steps)
     if known is not None:
         static = known["signs"][:, [SIGNS.index("static")]] > 0
         drive["steps"] = drive["steps"] * (static if repair else drive["fault"])
-    kept = cache / "flow" if repair or fault == "clean" else None  # which the signs read, too
+    kept = cache / "flow" if repair or fault == "clean" else None  # the signs read it, too
     return with_motion(drive, cache=kept, keep_images=False, repair=repair)
 
 
 def _read(
     root: Path, name: str, fault: str, steps: int, known: TensorDict | None, cache: Path, *, repair: bool = False
 ) -> TensorDict:
-    """Returns what the sensor reads, of a drive of which some may be known ``[N]``."""
+    """Returns the sensor's readings of a drive ``[N]``; readings of unaffected pairs are copied from ``known``."""
     car, motion = from_pretrained("car-odometry"), _motion(root, name, fault, steps, known, cache, repair=repair)
     out = read_sensor(car.sensor, motion, car.settings.longest).set("fault", motion["fault"])
     if known is None:
@@ -156,11 +156,11 @@ def _read(
 
 
 def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Tensor]) -> TensorDict:
-    """Of pairs of 1, 2, ... steps the shortest that is seen; none where none is: readings ``[N]``.
+    """Returns the readings ``[N]`` of the shortest observed pairs of 1, 2, ... steps.
 
     Args:
-        spans: what the sensor reads of them, ``[N]`` each.
-        seen: of readings, ``[N, 1]``: whether they are to be believed.
+        spans: readings of the pairs, ``[N]`` each.
+        seen: maps readings to their observed mask ``[N, 1]``.
     """
     values = {name: torch.stack([each["sensor", name] for each in spans], 1) for name in ("ensemble", "encoding")}
     values["observed"] = torch.stack([seen(each) for each in spans], 1)
@@ -169,7 +169,7 @@ def believed_spans(spans: Sequence[TensorDict], seen: Callable[[TensorDict], Ten
 
 
 def from_truth(reading: TensorDict) -> TensorDict:
-    """Readings ``[N]`` that begin at the true pose."""
+    """Returns readings ``[N]`` that begin at the true pose."""
     row = reading.copy()
     row["start"] = row["state"].clone()
     row["start"][0] = first_state(row)
@@ -178,7 +178,7 @@ def from_truth(reading: TensorDict) -> TensorDict:
 
 @torch.no_grad()
 def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed: int = 0) -> list[TensorDict]:
-    """Beliefs on readings ``[N]`` each, ``[draws, N]``, from the true pose on; those of one length run side by side."""
+    """Returns beliefs ``[draws, N]`` on each drive's readings ``[N]``, from the true first pose."""
     groups: dict[int, list[int]] = defaultdict(list)
     for place, reading in enumerate(readings):
         groups[len(reading)].append(place)
@@ -194,7 +194,7 @@ def filtered(model: Filter, readings: Sequence[TensorDict], draws: int = 1, seed
 
 
 def side_by_side(beliefs: Sequence[TensorDict]) -> list[TensorDict]:
-    """Beliefs ``[K, N]`` of one length each, joined into ``[K', N]``: a monitor runs over all at once."""
+    """Concatenates beliefs ``[K, N]`` of equal length to ``[K', N]``, so that a monitor runs over them in one batch."""
     groups: dict[int, list[TensorDict]] = defaultdict(list)
     for each in beliefs:
         groups[each.shape[1]].append(each)
@@ -205,7 +205,7 @@ def side_by_side(beliefs: Sequence[TensorDict]) -> list[TensorDict]:
 
 
 def car_filter() -> tuple[CarFilter, Filter]:
-    """The trained filter, and the same behind its sensor."""
+    """Returns the trained filter, and the same filter without its sensor."""
     car = from_pretrained("car-odometry")
     assert isinstance(car, CarFilter)
     return car, car.without_sensor()

@@ -1,4 +1,4 @@
-"""Measures the cost of a gate where the camera is sound: ``python -m benchmarks.monitor.responses --root RENDERED``."""
+"""Measures the cost of gating without sensor faults: ``python -m benchmarks.monitor.responses --root RENDERED``."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ DRAWS = 8
 
 @dataclass(frozen=True)
 class Responses:
-    """The shipped filter behind gates, on drives without a fault; every other drive calibrates the gates."""
+    """Options of the comparison of gates on drives without faults; half of the drives calibrate the gates."""
 
-    root: Path  # drives that `denkf render-kitti` left
-    out: Path = Path("runs/monitor")  # flow, signs and readings
+    root: Path  # drives that `denkf render-kitti` wrote
+    out: Path = Path("runs/monitor")  # folder for optical flow, signs and readings
     drives: int = 8
 
 
 def degrees(filter: Filter, drives: list[TensorDict]) -> Tensor:
-    """Mean absolute error of the heading, a number for each drive."""
+    """Returns the mean absolute heading error of each drive, in degrees."""
     off = [
         one["belief", "mean"][..., 2] - drive["state"][:, 2]
         for one, drive in zip(filtered(filter, drives, DRAWS), drives, strict=True)
@@ -47,7 +47,7 @@ def main() -> None:
         drives.append(believed_spans([reading], lambda one: one["observed"]))
     known, test = drives[::2], drives[1::2]
     print(f"`{command('monitor.responses')}`\n")
-    print("\n".join(head("gate", "error of the heading, degrees, mean of the drives", "worst drive")))
+    print("\n".join(head("gate", "heading error (deg), mean of the drives", "worst drive")))
     for name in ("no gate", "student", "huber", "reject"):
         filter = model if name == "no gate" else Gated(model, 2, response=name).calibrate(list(map(from_truth, known)))
         off = degrees(filter, test)

@@ -1,4 +1,4 @@
-"""Tells how soon and how surely an alarm tells a fault, and what a gate makes of it."""
+"""Scores of a monitor's alarms, and errors after a fault."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-AFTER = 10  # steps after a fault in which an alarm is neither right nor wrong, and an error may settle
+AFTER = 10  # steps after a fault in which alarms are not scored, and errors may settle
 
 
 class Run(NamedTuple):
-    """Holds what a monitor said of one run; all ``[T]``.
+    """Output of a monitor on one run; all ``[T]``.
 
     Attributes:
-        evidence: of which 1 is the limit.
+        evidence: in units of its limit.
         alarm: bool.
-        fault: bool: whether the reading of the step is of a fault.
+        fault: bool: whether the step has a faulty reading.
     """
 
     evidence: Tensor
@@ -27,27 +27,27 @@ class Run(NamedTuple):
 
 
 def spans_of(fault: Tensor) -> list[tuple[int, int]]:
-    """First step and the one behind the last, of each stretch that is True in ``[T]``."""
+    """Returns first step and end (exclusive) of each stretch of True in ``[T]``."""
     edges = torch.cat([torch.zeros(1), fault.float(), torch.zeros(1)]).diff()
     return list(zip((edges > 0).nonzero().flatten().tolist(), (edges < 0).nonzero().flatten().tolist(), strict=True))
 
 
 def auroc(score: Tensor, positive: Tensor) -> float:
-    """Probability that a positive has the higher score than a negative, ties half; both ``[N]``."""
+    """Returns the probability that a positive's score is above a negative's; ties count half; both ``[N]``."""
     hit, other = score[positive].double(), score[~positive].double().sort().values
     below = torch.searchsorted(other, hit, right=False) + torch.searchsorted(other, hit, right=True)
     return float(below.double().mean() / 2 / len(other))
 
 
 def detection(runs: Sequence[Run]) -> dict[str, float]:
-    """Scores of runs with faults.
+    """Returns scores of runs with faults.
 
-    Neither the first step, which sees no reading, nor the ten steps after a fault count.
+    The first step, which has no reading, and the ten steps after a fault are not scored.
 
     Returns:
-        ``auroc`` of the evidence for "in a fault" against "not"; ``delay_steps``, the median of the steps from a
-        fault's first to the first with an alarm, infinite where there is none; ``found``, the share of the faults that
-        raise an alarm while they last.
+        ``auroc`` of the evidence for steps with a fault; ``delay_steps``, the median of the steps from a fault's first
+        step to its first alarm, infinite without one; ``found``, the share of the faults that raise an alarm while they
+        last.
     """
     scores, labels, delays = [], [], []
     for run in runs:
@@ -65,7 +65,7 @@ def detection(runs: Sequence[Run]) -> dict[str, float]:
 
 
 def false_alarms(runs: Sequence[Run]) -> dict[str, float]:
-    """Of runs without a fault, in 1,000 steps: alarms that are raised, and steps at which one is on."""
+    """Returns the alarms raised, and the steps under an alarm, in 1,000 steps of runs without a fault."""
     alarms = [run.alarm[1:] for run in runs]
     steps = sum(len(alarm) for alarm in alarms)
     raised = sum(len(spans_of(alarm)) for alarm in alarms)
@@ -74,5 +74,5 @@ def false_alarms(runs: Sequence[Run]) -> dict[str, float]:
 
 
 def afterwards(error: Tensor, fault: Tensor, steps: int = 20) -> Tensor:
-    """Of errors ``[*K, T]`` those of ``steps`` steps, from ten after each fault of ``[T]`` on: ``[*K, N]``."""
+    """Selects errors ``[*K, N]`` of ``[*K, T]`` in ``steps`` steps, from ten steps after each fault of ``[T]`` on."""
     return torch.cat([error[..., end + AFTER : end + AFTER + steps] for _, end in spans_of(fault)], -1)

@@ -19,8 +19,6 @@ from torch_denkf.applications.car.kitti.drive import list_kitti_drives
 from torch_denkf.applications.car.kitti.render import render_drives
 
 TASKS = ("ur5", "kitti-real", "kitti-rendered")
-ALARMS = ("auroc", "delay_steps", "false_alarms_per_1000", "error_ratio")
-PATHS = ("m_per_m", "held_v", "held_theta_dot", "m_per_m_gated", "held_v_gated", "held_theta_dot_gated")
 
 
 INVENTED = {"calibration": 16, "validation": 8}  # drives along random roads
@@ -29,21 +27,21 @@ SETTINGS = ("rate", "margin", "reference", "gate_margin")
 
 @dataclass(frozen=True)
 class Study:
-    """Faults that nobody announces, on the UR5 and on KITTI, with the weights that come with the package."""
+    """Measures detection of unannounced faults on the UR5 and on KITTI, with the package's weights."""
 
     root: Path | None = None  # KITTI's folder with sequences and poses; without it there is no task kitti-real
-    out: Path = Path("runs/monitor")  # also holds demos, rendered drives and readings
+    out: Path = Path("runs/monitor")  # also for demos, rendered drives and readings
     tasks: tuple[Literal["ur5", "kitti-real", "kitti-rendered"], ...] = TASKS
     rendered: tuple[str, ...] = ("00", "03", "04", "05", "07")  # drives along official trajectories, with faults
     frames: int = 600  # of a rendered drive
     draws: int = 3  # of the filter's noise
-    choose: bool = False  # choose margins, rates and references on drives and demos of its own, and test nothing
+    choose: bool = False  # choose margins, rates and references on separate drives and demos, without tests
     processes: int = 1
-    smoke: bool = False  # a tiny run on invented drives: does it run?
+    smoke: bool = False  # a tiny run on synthetic drives: does it run?
 
 
 def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
-    """The folder of rendered drives along random roads, and their names."""
+    """Returns the folder of rendered drives along random roads, and their names."""
     names = [f"{kind[0]}{number:02d}" for number in range(2 if study.smoke else INVENTED[kind])]
     frames = 80 if study.smoke else 500
     render_drives(study.out / kind, names=names, frames=frames, seed=77, size=(100, 300), processes=1)
@@ -51,7 +49,7 @@ def invented(study: Study, kind: str) -> tuple[Path, list[str]]:
 
 
 def rows_of(study: Study, task: str) -> list[dict]:
-    """The rows of one task."""
+    """Returns the rows of one task."""
     cache = study.out / "readings"
     if task == "ur5":
         from benchmarks.monitor.arm import arm_rows, own_demos  # needs mujoco
@@ -73,7 +71,7 @@ def rows_of(study: Study, task: str) -> list[dict]:
 
 
 def trials_of(study: Study, task: str) -> list[dict]:
-    """Returns what is tried for one task on drives or demos that are in no test, and in the last row what is chosen."""
+    """Returns the trials of one task on drives or demos that are in no test; the last row has the choice."""
     if task == "ur5":
         from benchmarks.monitor.arm import chosen_on, own_demos
         from benchmarks.monitor.choice import choose_arm
@@ -95,8 +93,8 @@ def trials_of(study: Study, task: str) -> list[dict]:
 
 
 def choice_page(rows: Sequence[dict], study: Study) -> str:
-    """Everything that was tried, and what is chosen."""
-    lines = ["# What is chosen, and on what", ""]
+    """Returns the page of all trials and the chosen settings."""
+    lines = ["# Chosen settings", ""]
     lines += head("trial", "setting", "score")
     for row in rows:
         said = ", ".join(f"{key} {row[key]:g}" for key in SETTINGS if key in row)
@@ -113,9 +111,9 @@ def choice_page(rows: Sequence[dict], study: Study) -> str:
 
 
 def page(rows: Sequence[dict], study: Study) -> str:
-    """Two tables: alarms, and errors."""
-    lines = ["# Faults that nobody announces", ""]
-    lines += head("task", "fault", "AUROC", "delay, steps", "found", "alarms in 1,000 sound steps", "error afterwards")
+    """Returns two tables: alarms, and errors."""
+    lines = ["# Unannounced faults", ""]
+    lines += head("task", "fault", "AUROC", "delay, steps", "found", "false alarms in 1,000 steps", "error afterwards")
     for row in rows:
         if "auroc" in row:
             cells = [f"{row[key]:.3g}" for key in ("auroc", "delay_steps", "found", "false_alarms_per_1000")]
@@ -151,7 +149,7 @@ def page(rows: Sequence[dict], study: Study) -> str:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study = parse(Study)
     if study.smoke:
         out = Path(tempfile.mkdtemp(prefix="monitor-"))

@@ -1,1 +1,1 @@
-"""Measures what a camera of one's own gets from ``denkf odometry``: no poses, a height that is known or guessed."""
+"""Measures the errors of ``denkf odometry`` for a calibrated camera whose height is known or guessed."""

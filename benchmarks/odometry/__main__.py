@@ -32,23 +32,23 @@ COLUMNS = ("drive", "height_m", "frames", "window", *ERRORS, "devkit_percent", "
 
 @dataclass(frozen=True)
 class Study:
-    """``denkf odometry`` on drives with known paths, at the right height of the camera and at wrong ones."""
+    """Runs ``denkf odometry`` on drives with known paths, with the right height of the camera and with wrong ones."""
 
     root: Path | None = None  # folder with sequences and poses
     out: Path = Path("runs/odometry")
-    drives: tuple[str, ...] = ()  # all that are found
+    drives: tuple[str, ...] = ()  # by default all drives in the folder
     heights: tuple[float, ...] = (KITTI_HEIGHT, 1.4, 2.0)  # m; KITTI's is 1.65
-    checkpoint: Path | None = None  # a folder that denkf train left; by default the weights that come with the package
+    checkpoint: Path | None = None  # a folder of denkf train; by default the weights that come with the package
     smoke: bool = False  # a tiny run on a rendered drive
 
 
 def track(study: Study, root: Path, drive: str, height: float) -> dict:
-    """One run of the command, and its errors."""
+    """Runs the command once, and returns its errors."""
     folder = root / "sequences" / drive
     camera = choose_camera(folder, None)
     out, images = study.out / f"{drive}-{height:g}", read_frames(folder / camera)
     poses = read_poses(root / "poses" / f"{drive}.txt")
-    clock = read_times(folder / "times.txt", len(poses))  # of the whole sequence, of which a part may have images
+    clock = read_times(folder / "times.txt", len(poses))  # of the whole sequence; only a part may have images
     stamps = study.out / f"{drive}.txt"
     write_text(stamps, "".join(f"{time}\n" for time in clock.times[images.first : images.first + images.count]))
     words: list[str] = [str(folder / camera), "--calibration", str(folder / "calib.txt"), "--camera", camera]
@@ -79,7 +79,7 @@ def track(study: Study, root: Path, drive: str, height: float) -> dict:
 
 
 def page(rows: Sequence[dict]) -> str:
-    """A table of all drives at the first height, and the means at each."""
+    """Returns a table of all drives at the first height, and the means at each height."""
     table = pd.DataFrame(rows, columns=COLUMNS)
     table["devkit"] = table["devkit_percent"].map("{:.2f}".format).replace("nan", "")
     table["devkit_turn"] = table["devkit_deg_per_100m"].map("{:.2f}".format).replace("nan", "")

@@ -1,10 +1,10 @@
-"""Tells how wrong speed and turn rate are for longer than a second, on drives with known poses.
+"""Estimates coloured errors of speed and turn rate on drives with known poses.
 
 ``python -m benchmarks.odometry.calibration --root KITTI --out FOLDER``
 
-The shipped filter has learned from rendered drives alone. How wrong its speed is on real ones, by a factor that lasts,
-and its turn rate, by an offset that lasts, only real ones can say. Each drive is scored with what the others say; the
-filter that is left has what all say.
+The shipped filter was trained on rendered drives alone. The scale error of its speed and the bias of its turn rate,
+each averaged over one second, are estimated on real drives. Each drive is scored with the estimates of the others; the
+saved filter has those of all.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from torch_denkf.applications.car.odometry.filter import VELOCITIES, CarFilter
 from torch_denkf.applications.car.odometry.streams import Drive, all_frames, read_spans
 
 SECOND = 10  # steps
-SLOW = 1.0  # m/s: below it a factor says nothing
-NEAREST = 0.05  # of the true speed: a reading that is smaller, or negative, counts as this
+SLOW = 1.0  # m/s: lower speeds are not used to estimate the scale
+NEAREST = 0.05  # share of the true speed at which smaller or negative readings are clamped
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrates the doubt about a factor on the speed and an offset of the turn rate, for each drive by the others."""
+    """Options of the calibration of the speed's scale error and the turn rate's bias, for each drive on the others."""
 
     root: Path  # folder with sequences and poses
-    out: Path = Path("runs/calibrated")  # gets the filter, with the doubt that all drives say
-    checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
+    out: Path = Path("runs/calibrated")  # folder for the filter, calibrated on all drives
+    checkpoint: str = "car-odometry"  # a pretrained filter, or a folder of denkf train
     draws: int = 8  # of the filter's noise
 
 
 def lasting_squares(car: CarFilter, root: Path, name: str) -> Tensor:
-    """Mean squares ``[2]`` of means over a second: the logarithm of read over true speed, the turn rate's error."""
+    """Returns mean squares ``[2]`` of one-second means: the log scale error of the speed, the turn rate error."""
     drive = Drive(root, name, car.settings.size, True, two_view=car.settings.two_view)
     run = all_frames(read_spans(car.sensor, [each.read() for each in drive.spans(1)], car.settings.longest))
     read, true = run["sensor", "ensemble"].mean(1)[1:], run["state"][1:, VELOCITIES]
@@ -51,8 +51,8 @@ def lasting_squares(car: CarFilter, root: Path, name: str) -> Tensor:
     return torch.stack([means.square().mean() for means in seconds])
 
 
-def doubted(checkpoint: str, factor: float, offset: float) -> CarFilter:
-    """The filter, with a doubt about its factor on the speed and about an offset of its turn rate."""
+def with_bias_stds(checkpoint: str, factor: float, offset: float) -> CarFilter:
+    """Returns the filter with standard deviations of the speed's scale error and the turn rate's bias."""
     car = from_pretrained(checkpoint)
     car["gain"].log_std.data[0] = torch.tensor(factor).log()
     car["gain"].offset_std[1] = offset
@@ -60,32 +60,28 @@ def doubted(checkpoint: str, factor: float, offset: float) -> CarFilter:
 
 
 def root_mean(squares: Iterable[Tensor]) -> list[float]:
-    """Root mean squares over some drives, each counted alike."""
+    """Returns root mean squares over drives, with equal weights."""
     return torch.stack(list(squares)).mean(0).sqrt().tolist()
 
 
 def main() -> None:
-    """Calibrates, scores, and leaves the filter."""
+    """Calibrates, scores, and saves the filter."""
     study = parse(Calibration)
     torch.set_num_threads(1)
     car, names = from_pretrained(study.checkpoint), list_kitti_drives(study.root)
     squares = {name: lasting_squares(car, study.root, name) for name in names}
     made_by = command("odometry.calibration")
-    print(f"`{made_by}`. Each drive is scored with the doubt that the others say; empty: shorter than 100 m.\n")
-    columns = (
-        "drive",
-        "doubt by the others: speed",
-        "turn rate, mrad/s",
-        "m/m",
-        "devkit, %",
-        "v held, %",
-        "turn held, %",
+    print(
+        f"`{made_by}`. Each drive is scored with the standard deviations of the other drives. "
+        "Drives shorter than 100 m have no devkit error.\n"
     )
-    print("\n".join(head(*columns, "sensor: m/m", "devkit, %")))
+    columns = "drive", "std of the others: scale", "turn rate (mrad/s)", "m/m", "devkit, %"
+    coverage = "coverage of v (%)", "coverage of the turn rate (%)"
+    print("\n".join(head(*columns, *coverage, "sensor: m/m", "devkit, %")))
     for name in names:
         factor, offset = root_mean(square for other, square in squares.items() if other != name)
         options = {"draws": study.draws, "progress": False}
-        rows, _ = evaluate_car_filter(doubted(study.checkpoint, factor, offset), study.root, [name], **options)
+        rows, _ = evaluate_car_filter(with_bias_stds(study.checkpoint, factor, offset), study.root, [name], **options)
         found = {row["method"]: row for row in rows}
         errors = [
             text
@@ -99,7 +95,7 @@ def main() -> None:
         print(line(name, f"{factor:.3f}", f"{1e3 * offset:.1f}", *errors[:2], *held, *errors[2:]), flush=True)
     factor, offset = root_mean(squares.values())
     record = {"command": made_by, "drives": names, "doubt": factor, "offset": offset}
-    save_pretrained(doubted(study.checkpoint, factor, offset), study.out, training={"calibration": record})
+    save_pretrained(with_bias_stds(study.checkpoint, factor, offset), study.out, training={"calibration": record})
     print(f"by all drives: {factor:.3f}, {1e3 * offset:.1f} mrad/s; {study.out}")
 
 

@@ -1,4 +1,4 @@
-"""A car's path with a box before its camera for ten seconds: ``python -m benchmarks.odometry.hidden --root KITTI``."""
+"""A car's path with an occluding box for ten seconds: ``python -m benchmarks.odometry.hidden --root KITTI``."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ RUNS = {"no box": (False, True), "a box, not looked for": (True, False), "a box,
 
 @dataclass(frozen=True)
 class Hidden:
-    """The shipped filter on drives whose camera looks past a box, with and without a look for what stands still."""
+    """Runs the shipped filter on drives with an occluding box, with and without detection of static regions."""
 
     root: Path  # folder with sequences and poses
-    checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
+    checkpoint: str = "car-odometry"  # a pretrained filter, or a folder of denkf train
 
 
 def main() -> None:

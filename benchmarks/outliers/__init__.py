@@ -1,1 +1,1 @@
-"""Readings of which a share is wrong: a cart."""
+"""Compares filters of a cart on readings with outliers."""

@@ -1,4 +1,4 @@
-"""The filters that are compared: with the true model and an update each, and learned ones."""
+"""The compared filters: with the true model and different updates, and learned ones."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _around(make: Callable) -> Callable[[Filter], Filter]:
     return lambda filter: filter.with_modules(analysis=make(filter["analysis"]))
 
 
-#: What stands around the update; ``Visible`` reads the share of sound readings from the data.
+#: Wrappers of the update; ``Visible`` reads the share of good readings from the data.
 UPDATES: dict[str, Callable[[Filter], Filter]] = {
     "plain": lambda filter: filter,
     'gate, "student"': lambda filter: Gated(filter, 1),
@@ -68,7 +68,7 @@ UPDATES: dict[str, Callable[[Filter], Filter]] = {
 
 
 def learned(members: int = 32) -> Filter:
-    """An ensemble whose motion, noises, share and width of outliers are learned."""
+    """Returns an ensemble whose motion, noises, share and width of outliers are learned."""
     network = nn.Sequential(nn.Linear(3, 32), nn.Tanh(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, 2))
     for parameter in network[-1].parameters():
         nn.init.zeros_(parameter)
@@ -85,7 +85,7 @@ def learned(members: int = 32) -> Filter:
 
 
 def lstm(hidden: int = 64) -> Filter:
-    """A recurrent network of the same readings and drives."""
+    """Returns a recurrent network of the same readings and drives."""
     return LSTMFilter(
         None,
         state_dim=2,

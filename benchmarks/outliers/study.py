@@ -1,4 +1,4 @@
-"""The study: its options, rows, and page."""
+"""Compares filters on readings of which one in five is an outlier: options, rows and page."""
 
 from __future__ import annotations
 
@@ -23,28 +23,29 @@ from torch_denkf import Filter
 from torch_denkf.functional.scores import crps_gaussian
 from torch_denkf.objectives import DEnKFLoss, GaussianLoss
 
-SCALE = [0.02, 0.1]  # m, m/s: about the standard deviation of what is known at best
+SCALE = [0.02, 0.1]  # m, m/s: about the posterior standard deviation of the optimal filter
 HALF = NormalDist().inv_cdf(0.95)
 SCORES = ("rmse_x", "rmse_v", "crps_x", "crps_v", "held")
+HEADS = ("RMSE, position", "RMSE, speed", "CRPS, position", "CRPS, speed")
 KEYS = ("model", "filter", "update", "draw")
 
 
 @dataclass(frozen=True)
 class Study:
-    """One reading in five is wrong: which filter copes?"""
+    """Options of the study of outliers."""
 
-    out: Path | None = None  # folder for outliers.csv and outliers.md; rows that are there stay
-    runs: int = 100  # of the test
-    particles: int = 100_000  # of what can be known at best
-    training: int = 500  # runs to learn from
-    draws: int = 5  # of ensembles
-    trainings: int = 5
-    updates: tuple[int, int] = (100, 700)  # of the ensemble, and of the LSTM
-    smoke: bool = False  # two runs, two updates: does it run?
+    out: Path | None = None  # folder for outliers.csv and outliers.md; existing rows are kept
+    runs: int = 100  # test runs
+    particles: int = 100_000  # of the reference, a particle filter with the true model
+    training: int = 500  # training runs
+    draws: int = 5  # seeds of an ensemble filter
+    trainings: int = 5  # seeds of a trained filter
+    updates: tuple[int, int] = (100, 700)  # training updates of the ensemble filter, and of the LSTM
+    smoke: bool = False  # a short check: two runs, two updates
 
 
 def scores(error: Tensor, crps: Tensor, held: Tensor) -> dict[str, float]:
-    """Root mean square errors and CRPS of position, m, and speed, m/s; share held by the 90 % intervals."""
+    """Returns RMSE and CRPS of position (m) and speed (m/s), and the coverage of the 90 % intervals."""
     error, crps, held = (value[:, SKIP:].flatten(0, 1) for value in (error, crps, held))
     values = (*error.square().mean(0).sqrt(), *crps.mean(0), held.float().mean())
     return {name: float(value) for name, value in zip(SCORES, values, strict=True)}
@@ -52,7 +53,7 @@ def scores(error: Tensor, crps: Tensor, held: Tensor) -> dict[str, float]:
 
 @torch.no_grad()
 def score(filter: Filter, data: TensorDict, draw: int) -> dict[str, float]:
-    """The scores of a filter as a Gaussian, and milliseconds a step of all runs."""
+    """Returns the scores of a filter's mean and variance, and the milliseconds of a step of all runs."""
     torch.manual_seed(draw)
     began = time.process_time()
     belief = filter.sequence(data.clone(), keep=[("belief", "mean"), ("belief", "var")])["belief"]
@@ -62,7 +63,7 @@ def score(filter: Filter, data: TensorDict, draw: int) -> dict[str, float]:
 
 
 def fit(filter: Filter, loss: nn.Module, updates: int, rate: float, data: tuple) -> Filter:
-    """Trains on windows of whole runs; validation data choose the update that is kept."""
+    """Trains on whole runs, and keeps the parameters with the least validation error."""
     train, validation = data
     least, kept, every = float("inf"), filter.state_dict(), max(1, updates // 7)
 
@@ -85,7 +86,7 @@ def fit(filter: Filter, loss: nn.Module, updates: int, rate: float, data: tuple)
 
 
 def trained(kind: str, study: Study, draw: int, data: tuple) -> Filter:
-    """A learned filter."""
+    """Returns a trained filter."""
     torch.manual_seed(draw)
     if kind == "LSTM":
         filter, loss = lstm(), partial(GaussianLoss, score="crps")
@@ -96,7 +97,7 @@ def trained(kind: str, study: Study, draw: int, data: tuple) -> Filter:
 
 
 def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
-    """Yields what makes each row, by model, filter, update and draw."""
+    """Returns the function that computes each row, by model, filter, update and seed."""
     told = test.clone().set("sound", torch.full((*test.shape, 1), 1 - SHARE))
     training = recordings(study.training, 100), recordings(study.training // 2, 101)
     jobs: dict[tuple, Callable[[], dict]] = {
@@ -117,16 +118,17 @@ def planned(study: Study, test: TensorDict) -> dict[tuple, Callable[[], dict]]:
 
 
 def page(rows: list[dict], study: Study) -> str:
-    """The table."""
+    """Returns the page."""
     (truth,) = pick(rows, filter="truth")
     lines = [
-        "# A cart, one of five of whose positions is read wrongly",
+        "# A cart whose position readings have 20 % outliers",
         "",
-        f"Errors and CRPS over those of {study.particles:,} particles with the true model ({truth['rmse_x']:.3f} m and "
-        f"{truth['rmse_v']:.3f} m/s; {truth['crps_x']:.3f} m and {truth['crps_v']:.3f} m/s; {truth['held']:.0%} held). "
-        f"{study.runs} runs of 2 s. What draws: mean, and range, of the draws. Ensembles have 32 members.",
+        "RMSE and CRPS are ratios to those of a particle filter with the true model and "
+        f"{study.particles:,} particles ({truth['rmse_x']:.3f} m and {truth['rmse_v']:.3f} m/s; {truth['crps_x']:.3f} "
+        f"m and {truth['crps_v']:.3f} m/s; coverage {truth['held']:.0%}). {study.runs} runs of 2 s. Rows with several "
+        "seeds give the mean and the range. Ensembles have 32 members.",
         "",
-        *head("model", "filter", "update", "RMSE, position", "speed", "CRPS, position", "speed", "held", "ms", "draws"),
+        *head("model", "filter", "update", *HEADS, "coverage", "ms", "seeds"),
     ]
     for name in dict.fromkeys((row["model"], row["filter"], row["update"]) for row in rows if row["model"]):
         own = [row for row in rows if (row["model"], row["filter"], row["update"]) == name]
@@ -138,7 +140,7 @@ def page(rows: list[dict], study: Study) -> str:
 
 
 def span(values: list[float], layout: str) -> str:
-    """The mean of draws, and from where to where they go."""
+    """Returns the mean of values and their range, as text."""
     low, high, mean = (layout.format(value) for value in (min(values), max(values), sum(values) / len(values)))
     return mean if low == high else f"{mean} ({low} to {high})"
 
@@ -151,7 +153,7 @@ def main() -> None:
     torch.set_num_threads(1)
     file = None if study.out is None else study.out / "outliers.csv"
     found = [] if file is None else records(file)
-    rows = [{**dict.fromkeys(KEYS, ""), **row} for row in found]  # what is empty is not read
+    rows = [{**dict.fromkeys(KEYS, ""), **row} for row in found]  # empty cells are missing from the read rows
     there = {tuple(row[key] for key in KEYS) for row in rows}
     for name, job in planned(study, recordings(study.runs, 0)).items():
         if name not in there:

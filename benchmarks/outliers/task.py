@@ -1,4 +1,4 @@
-"""A cart with dry friction, one of five of whose positions is read wrongly; and what can be known of it at best."""
+"""A cart with dry friction whose position readings have 20 % outliers; and a particle filter with the true model."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torch_denkf.modules import SubModel
 __all__ = ["SHARE", "SKIP", "START", "WRONG", "ReadingNoise", "SpeedNoise", "best", "moved", "recordings"]
 
 DT, STEPS, SKIP = 0.05, 40, 8  # s; steps of a run; steps that are not scored
-SHARE, WRONG = 0.2, 2.0  # of wrong readings, and their standard deviation, m
+SHARE, WRONG = 0.2, 2.0  # of outliers, and their standard deviation, m
 START = [0.5, 0.5]  # standard deviations of position, m, and speed, m/s, at the start
 
 
 def moved(driven: Tensor) -> Tensor:
-    """Positions and speeds ``[*, 2]`` a step later than positions, speeds and drives ``[*, 3]``: dry friction and drag.
+    """Returns the next positions and speeds ``[*, 2]`` from positions, speeds and drives ``[*, 3]``.
 
-    Below 0.05 m/s and 1.2 m/s^2 the cart sticks.
+    The cart has dry friction and drag; it sticks below 0.05 m/s and 1.2 m/s^2.
     """
     x, v, u = driven.unbind(-1)
     slid = v + DT * (u - 0.8 * v.sign() - 0.1 * v)
@@ -31,42 +31,42 @@ def moved(driven: Tensor) -> Tensor:
 
 
 def speed_std(speed: Tensor) -> Tensor:
-    """Standard deviation of what a step adds to the speed, m/s."""
+    """Returns the standard deviation of the process noise of the speed, m/s."""
     return 0.02 + 0.1 * speed.abs()
 
 
 def reading_std(position: Tensor) -> Tensor:
-    """Standard deviation of a sound reading, m."""
+    """Returns the standard deviation of a reading that is no outlier, m."""
     return 0.02 + 0.05 * position.abs()
 
 
 class SpeedNoise(SubModel):
-    """Q at the belief's mean."""
+    """Computes Q at the belief's mean."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "mean")], [("forecast", "noise")])
 
     def compute(self, mean):
-        """The variances ``[*B, 2]``."""
+        """Returns the variances ``[*B, 2]``."""
         variance = speed_std(mean[..., 1]).square()
         return torch.stack([torch.zeros_like(variance), variance], -1)
 
 
 class ReadingNoise(SubModel):
-    """R of a sound reading at a forecast: its mean ``[*B, 2]``, or the mean over its members ``[*B, E, 2]``."""
+    """Computes R without outliers at a forecast: at its mean ``[*B, 2]``, or averaged over members ``[*B, E, 2]``."""
 
     def __init__(self, name: str):
         super().__init__(nn.Identity(), [("forecast", name)], [("sensor", "noise")])
         self.of_members = name == "ensemble"
 
     def compute(self, state):
-        """The variance ``[*B, 1]``."""
+        """Returns the variance ``[*B, 1]``."""
         variance = reading_std(state[..., :1]).square()
         return variance.mean(-2) if self.of_members else variance
 
 
 def drives(runs: int, steps: int, generator: torch.Generator) -> Tensor:
-    """Sines of 0.3 to 0.8 Hz with an offset, ``[runs, steps, 1]``, up to 4 m/s^2."""
+    """Returns drives ``[runs, steps, 1]``: sines of 0.3 to 0.8 Hz with an offset, up to 4 m/s^2."""
     rate, phase, size, offset = (torch.rand(4, runs, 1, generator=generator)).unbind()
     time = DT * torch.arange(steps)
     sine = (2 * math.pi * ((0.3 + 0.5 * rate) * time + phase)).sin()
@@ -74,7 +74,7 @@ def drives(runs: int, steps: int, generator: torch.Generator) -> Tensor:
 
 
 def recordings(runs: int, seed: int, steps: int = STEPS) -> TensorDict:
-    """True states ``[runs, steps, 2]``, drives, and readings, the first of which is at the start."""
+    """Returns true states ``[runs, steps, 2]``, drives, and readings; the first reading is of the initial state."""
     generator = torch.Generator().manual_seed(seed)
     draw = partial(torch.randn, generator=generator)
     action, states = drives(runs, steps, generator), [torch.tensor(START) * draw(runs, 2)]
@@ -90,7 +90,7 @@ def recordings(runs: int, seed: int, steps: int = STEPS) -> TensorDict:
 
 
 def best(data: TensorDict, particles: int, kept: int = 2000) -> dict[str, Tensor]:
-    """Errors, CRPS and coverage ``[runs, steps, 2]`` of a particle filter with the true model, run by run."""
+    """Returns errors, CRPS and coverage ``[runs, steps, 2]`` of a particle filter with the true model."""
     generator = torch.Generator().manual_seed(0)
     draw, found = partial(torch.randn, generator=generator), {"error": [], "crps": [], "held": []}
     for run in data.unbind(0):

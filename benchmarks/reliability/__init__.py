@@ -1,1 +1,1 @@
-"""Attacks on every border of the library, and runs that last: right, or a message that says what is not."""
+"""Tests every interface of the library with damaged inputs, and in long runs."""

@@ -1,4 +1,4 @@
-"""One damaged input, run in a process of its own, and the verdict on what came out."""
+"""Runs one damaged input in a separate process, and returns a verdict on the outcome."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from benchmarks.reliability.hostile import MARK
 Kind = Literal["clear", "right", "unclear", "silent", "hang", "crash"]
 
 SECONDS = 20.0  # after which a case counts as a hang
-MEMORY = 6 << 30  # bytes of address space that a case may take beyond those of the process that starts it
+MEMORY = 6 << 30  # bytes of address space that a case may use in addition to its parent's
 LIBRARY = str(Path(torch_denkf.__file__).parent)
 
 
@@ -36,12 +36,12 @@ class Case:
     """A damaged input.
 
     Args:
-        border: where it comes in.
-        name: what is damaged, and how; unique in its border.
-        words: arguments, keys or files that were damaged: a clear message has one of them as a word.
-        act: does what a user would do, in an empty folder that it is given.
-        right: whether a result is right, as the sound part of the input tells; ``None`` where it must raise.
-        within: s in which it must be over.
+        border: interface of the library.
+        name: the damaged part and its damage; unique in its border.
+        words: damaged arguments, keys or files: a clear message has one of them as a word.
+        act: uses the input as a user would, in a given empty folder.
+        right: whether a result is right, judged by the undamaged part of the input; ``None`` if the case must raise.
+        within: time limit in s.
     """
 
     border: str
@@ -58,13 +58,13 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Says what came out of a case.
+    """Outcome of a case.
 
     Attributes:
-        kind: ``clear``: an error raised in this library that names what was damaged. ``right``: no error, and the
-            result of the sound part. ``silent``: no error, and no right result. ``unclear``: any other error.
-            ``hang``: not over in time. ``crash``: the process was ended by a signal.
-        text: the message, or what is known of it.
+        kind: ``clear``: an error raised in this library that names the damaged part. ``right``: no error, and the
+            result of the undamaged part. ``silent``: no error, and no right result. ``unclear``: any other error.
+            ``hang``: not finished in time. ``crash``: the process was ended by a signal.
+        text: the message, or a description of the outcome.
     """
 
     kind: Kind
@@ -72,7 +72,7 @@ class Verdict:
 
 
 def forked(work: Callable[[], Any], log: Path | None = None) -> int:
-    """Starts something in a process of its own session, whose output goes to a file; returns its number."""
+    """Runs ``work`` in a forked process with its own session, whose output goes to a file; returns its id."""
     sys.stdout.flush()
     child = os.fork()
     if child:
@@ -94,7 +94,7 @@ def forked(work: Callable[[], Any], log: Path | None = None) -> int:
 
 
 def apart(work: Callable[[], Any]) -> None:
-    """Runs something in a forked process: what it imports, compiles or computes with threads stays there."""
+    """Runs ``work`` in a forked process, so that its imports, compiled code and threads do not stay in this one."""
     _, status = os.waitpid(forked(work), 0)
     if status:
         raise RuntimeError(f"{work} failed; see above")
@@ -102,14 +102,14 @@ def apart(work: Callable[[], Any]) -> None:
 
 @cache
 def workshop() -> Path:
-    """A folder for what cases start from; it goes with the process that made it."""
+    """Returns a folder for the cases' undamaged inputs, which is deleted when its process ends."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz-sound-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # not in forked children, which leave by os._exit
     return folder
 
 
 def judge(case: Case) -> Verdict:
-    """Runs a case in a forked process, so that neither a crash nor a hang nor what it changes reaches another one."""
+    """Runs a case in a forked process, so that its crashes, hangs and side effects do not affect other cases."""
     with tempfile.TemporaryDirectory(prefix="fuzz-", ignore_cleanup_errors=True) as root:
         folder, said = Path(root, "work"), Path(root, "verdict")
         folder.mkdir()
@@ -118,7 +118,7 @@ def judge(case: Case) -> Verdict:
         while not over and time.monotonic() < end:
             time.sleep(0.002)
             over, status = os.waitpid(child, os.WNOHANG)
-        with suppress(ProcessLookupError):  # its own children, too; it may be gone, or not as far as setsid
+        with suppress(ProcessLookupError):  # with its children; it may have ended, or not yet called setsid
             os.killpg(child, signal.SIGKILL)
         if not over:
             os.waitpid(child, 0)
@@ -130,7 +130,7 @@ def judge(case: Case) -> Verdict:
 
 
 def _run(case: Case, folder: Path, said: Path) -> None:
-    """In the child: the case, and its verdict into a file."""
+    """Runs the case in the child, and writes its verdict to a file."""
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -156,11 +156,11 @@ def verdict_on(case: Case, folder: Path) -> Verdict:
         right = bool(case.right(result))
     except Exception as error:
         return Verdict("silent", f"the result cannot be compared: {type(error).__name__}: {error}"[:500])
-    return Verdict("right") if right else Verdict("silent", "a result, and not that of the sound part")
+    return Verdict("right") if right else Verdict("silent", "a result, and not that of the undamaged part")
 
 
 def _of_error(case: Case, error: Exception) -> Verdict:
-    """Clear, if raised in this library with a word of the case in it."""
+    """Returns the verdict on an error: clear if it was raised in this library with one of the case's words."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     message = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     ours = last.filename.startswith(LIBRARY) or isinstance(error, Refused)

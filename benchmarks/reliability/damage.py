@@ -1,4 +1,4 @@
-"""A small vocabulary of damage: wrong values, changed files and entries, each with a name or drawn by hypothesis."""
+"""Wrong values, damaged files and damaged entries, each with a name or drawn by hypothesis."""
 
 from __future__ import annotations
 
@@ -22,46 +22,46 @@ Change = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class Wrong:
-    """Wrong values of one thing.
+    """Wrong values of one argument, entry or file.
 
     Args:
-        named: those that are always tried, by what is wrong with them.
-        others: draws more of them, each with its name.
+        named: values that are always tried, by the name of their defect.
+        others: strategy that draws further values, each with its name.
     """
 
     named: Mapping[str, Any]
     others: Named = st.nothing()  # noqa: RUF009 - it cannot be changed
 
     def __or__(self, more: Wrong | Mapping[str, Any]) -> Wrong:
-        """Adds further ones."""
+        """Adds further values."""
         more = more if isinstance(more, Wrong) else Wrong(more)
         return Wrong({**self.named, **more.named}, self.others | more.others)
 
     def without(self, *names: str) -> Wrong:
-        """Leaves out those that are not wrong here; others are drawn."""
+        """Removes named values that are valid here; values are still drawn."""
         return replace(self, named={name: value for name, value in self.named.items() if name not in names})
 
     def but(self, *names: str) -> Wrong:
-        """Leaves out those that are not wrong here; none is drawn, as it might be one of them."""
+        """Removes named values that are valid here, and the strategy, which might draw them."""
         return Wrong(self.without(*names).named)
 
     def each(self, change: Callable[[Any], Any]) -> Wrong:
-        """Makes something of every value."""
+        """Maps every value."""
         others = self.others.map(lambda other: (other[0], change(other[1])))
         return Wrong({name: change(value) for name, value in self.named.items()}, others)
 
     def some(self) -> Named:
-        """Draws any of them, with its name."""
+        """Draws any value, with its name."""
         return st.sampled_from(sorted(self.named.items(), key=lambda one: one[0])) | self.others
 
 
 def drawn(values: st.SearchStrategy[Any]) -> Named:
-    """Draws values under their own names."""
+    """Draws values, named by their representation."""
     return values.map(lambda value: (_name(value), value))
 
 
 def of(*values: Any, others: st.SearchStrategy[Any] | None = None) -> Wrong:
-    """Returns values under their own names."""
+    """Returns values, named by their representation."""
     return Wrong({_name(value): value for value in values}, st.nothing() if others is None else drawn(others))
 
 
@@ -93,18 +93,18 @@ CELLS = of((0,), (-4,), (2.5,), "wide", others=st.tuples(st.just(4), NO_COUNT))
 
 
 def indices(size: int) -> Wrong:
-    """Indices of components, none of which fits ``size`` of them."""
+    """Returns invalid indices of ``size`` components."""
     beyond = st.integers(min_value=size, max_value=99) | st.integers(-99, -size - 1)
     return of([size], [-size - 1], [0.5], ["x"], others=beyond.map(lambda index: [0, index]))
 
 
 def dims(size: int) -> Wrong:
-    """Returns indices of components that are read: each at most once."""
+    """Returns invalid indices of observed components, which must also be distinct."""
     return indices(size) | {"twice the same": [0, 0]}
 
 
 def vector(size: int, *, positive: bool = False, negative: bool = True, length: bool = True) -> Wrong:
-    """Vectors that are none of ``size`` finite numbers; ``positive`` where zero is wrong, too."""
+    """Returns wrong values of a vector of ``size`` finite numbers; with ``positive``, zero is wrong, too."""
 
     def of(last: float, place: int = -1) -> list[float]:
         out = [1.0] * size
@@ -125,7 +125,7 @@ def vector(size: int, *, positive: bool = False, negative: bool = True, length: 
 
 
 def spoiled(place: Any, value: Any) -> Change:
-    """Puts a value into a copy of an array or a tensor; a fraction is a place along all of its numbers."""
+    """Puts a value into a copy of an array or a tensor, at an index or at a fraction of its flattened length."""
 
     def change(array: Any) -> Any:
         out = array.clone() if isinstance(array, Tensor) else array.copy()
@@ -137,13 +137,13 @@ def spoiled(place: Any, value: Any) -> Change:
 
 
 def broken(*at: int, places: st.SearchStrategy[tuple[int, ...]]) -> Wrong:
-    """NaN and infinity in an element ``at`` of an array, in all of it, and in drawn places."""
+    """Puts NaN and infinity at the index ``at`` of an array, and at random places."""
     others = st.tuples(places | st.just(at), st.sampled_from([NAN, INF, -INF]))
     return Wrong({"a NaN": ((*at, 0), NAN), "inf": ((*at, -1), INF)}, drawn(others)).each(lambda one: spoiled(*one))
 
 
 MISSING = object()
-#: Shapes that an entry ``[..., D]`` does not have.
+#: Wrong shapes of an entry ``[..., D]``.
 SHAPES = Wrong(
     {
         "missing": MISSING,
@@ -156,7 +156,7 @@ SHAPES = Wrong(
 
 
 def matrix(rows: int, columns: int) -> Wrong:
-    """Matrices that are none of ``rows`` by ``columns`` finite numbers."""
+    """Returns wrong values of a matrix of ``rows`` by ``columns`` finite numbers."""
     eye = torch.eye(rows, columns)
     places = st.tuples(st.integers(0, rows - 1), st.integers(0, columns - 1))
     numbers = broken(0, places=places).each(lambda change: change(eye))
@@ -166,7 +166,7 @@ def matrix(rows: int, columns: int) -> Wrong:
 
 
 def covariance(size: int) -> Wrong:
-    """Matrices that are no covariance of ``size`` components."""
+    """Returns wrong values of a covariance of ``size`` components."""
     eye, ones = torch.eye(size), torch.ones(size, size)
     return matrix(size, size) | {
         "not symmetric": spoiled((0, -1), 0.5)(eye),
@@ -180,12 +180,12 @@ def covariance(size: int) -> Wrong:
 
 
 def copied(sound: Path, folder: Path) -> Path:
-    """A copy of a folder that a case may damage."""
+    """Returns a copy of a folder that a case may damage."""
     return Path(shutil.copytree(sound, folder / sound.name, symlinks=True))
 
 
 def gone(file: Path) -> None:
-    """Takes a file or folder away."""
+    """Deletes a file or folder."""
     if file.is_dir():
         shutil.rmtree(file)
     else:
@@ -198,12 +198,12 @@ def written(change: Callable[[bytes], bytes]) -> Change:
 
 
 def instead(make: Change) -> Change:
-    """Puts something else in a file's place."""
+    """Replaces a file."""
     return lambda file: (gone(file), make(file))
 
 
 def renamed(name: str) -> Change:
-    """Gives a file another name."""
+    """Renames a file."""
     return lambda file: file.rename(file.with_name(name))
 
 
@@ -217,7 +217,7 @@ def flipped(at: float, mask: int = 0xFF) -> Callable[[bytes], bytes]:
     return flip
 
 
-#: What happens to the bytes of a file whose format tells no flipped byte.
+#: Damage to the bytes of a file whose format does not detect flipped bytes.
 CUT = Wrong(
     {
         "empty": lambda data: b"",
@@ -233,9 +233,9 @@ FLIPPED = Wrong(
     {f"a byte flipped at {at}": flipped(at) for at in (0.0, 0.5, 0.95)},
     st.floats(0.0, 0.99).map(lambda at: (f"a high bit flipped at {at}", flipped(at, 0x80))),
 ).each(written)
-#: What happens to a file's bytes.
+#: Damage to a file's bytes.
 BYTES = CUT | FLIPPED
-#: Damage of files whose format or checksum tells every cut and every bit.
+#: Damage to files whose format or checksum detects every cut and every flipped bit.
 SEALED = BYTES.but() | Wrong(
     {},
     st.floats(0.0, 0.99).map(lambda at: (f"cut at {at}", written(lambda data: data[: int(at * len(data))])))
@@ -243,7 +243,7 @@ SEALED = BYTES.but() | Wrong(
         lambda place: (f"bit {place[1]} flipped at {place[0]}", written(flipped(place[0], 1 << place[1])))
     ),
 )
-#: What stands in a file's place.
+#: Replacements of a file.
 PLACES = Wrong(
     {
         "taken away": gone,
@@ -254,9 +254,9 @@ PLACES = Wrong(
         "a pipe": instead(os.mkfifo),
     }
 )
-#: Ways for a file not to be there.
+#: Ways in which a file may be missing.
 NOTHING = PLACES.but("a folder", "a link to a device", "a pipe")
-#: All that happens to a file.
+#: All damage to a file.
 FILE = BYTES | PLACES
 
 
@@ -264,11 +264,11 @@ FILE = BYTES | PLACES
 
 
 def put(path: Any, value: Any) -> Change:
-    """Puts a value into nested entries, or takes it away; of a function, what it makes of the value.
+    """Sets, maps or deletes a value in nested entries.
 
     Args:
-        path: keys and numbers; a single one may stand alone.
-        value: the value, a function of the old one, or ``MISSING``.
+        path: tuple of keys and indices, or a single one.
+        value: the value, a function of the old one, or ``MISSING`` to delete it.
     """
     path = path if isinstance(path, tuple) else (path,)
 
@@ -288,7 +288,7 @@ def put(path: Any, value: Any) -> Change:
 
 
 def leaves(result: Any) -> dict[str, Tensor]:
-    """The tensors of a result, by name."""
+    """Returns the tensors of a result, by name."""
     if isinstance(result, Tensor):
         return {"": result}
     if isinstance(result, TensorDictBase):
@@ -301,12 +301,12 @@ def leaves(result: Any) -> dict[str, Tensor]:
 
 
 def finite(result: Any) -> bool:
-    """Tells whether all numbers are finite."""
+    """Returns whether all values are finite."""
     return all(bool(value.isfinite().all()) for value in leaves(result).values())
 
 
 def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
-    """Tells whether two results have the same entries of the same types, with the same numbers."""
+    """Returns whether two results have the same entries with the same types and values."""
     one, other = leaves(result), leaves(expected)
     return one.keys() == other.keys() and all(
         (one[key].shape, one[key].dtype) == (other[key].shape, other[key].dtype)
@@ -316,12 +316,12 @@ def same(result: Any, expected: Any, *, rtol: float = 0.0, atol: float = 0.0) ->
 
 
 def kept(result: Any, expected: Any, *, most: int = 1, rtol: float = 0.0) -> bool:
-    """Tells whether rows are as expected, but for some that are marked as missing, or lack at the end.
+    """Returns whether rows are as expected, except for some that are masked, or missing at the end.
 
     Args:
         result: entries ``[N, ...]``.
-        expected: likewise, maybe longer; its boolean entries are masks, False where a row's reading does not count.
-        most: so many rows may be marked.
+        expected: the same, maybe longer; its boolean entries are masks, False for missing readings.
+        most: largest number of masked rows.
         rtol: of the comparison.
     """
     one, other = leaves(result), leaves(expected)

@@ -1,4 +1,4 @@
-"""Documents: files that are trees of values, each of which may be wrong, and be written again."""
+"""Reads files as trees of values, and writes them again with a wrong value in any place."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from benchmarks.reliability import damage as d
 from benchmarks.reliability.damage import INF, NAN
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
-Place = tuple[Any, ...]  # keys and numbers, from the root of a tree
+Place = tuple[Any, ...]  # keys and indices from the root of a tree
 
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file, as a tree of dictionaries, lists and leaves.
+    """A file format, read as a tree of dictionaries, lists and leaves.
 
     Args:
         load: reads the tree.
         dump: writes it.
         text: whether all leaves are words.
-        columns: whether it has columns of one length, of which only the whole may be missing.
+        columns: whether the file has columns of equal length, of which only whole ones may be missing.
     """
 
     load: Callable[[Path], Any]
@@ -41,7 +41,7 @@ class Format:
     columns: bool = False
 
     def wrong(self, place: Place, leaf: Any) -> d.Wrong:
-        """Returns values that are wrong in a place of the tree, and that it is missing."""
+        """Returns wrong values for a place of the tree, and its deletion."""
         missing = d.Wrong({} if self.columns and len(place) == 2 else {"missing": d.MISSING})
         return missing if self.columns and len(place) == 1 else wrong_of(leaf, self.text) | missing
 
@@ -65,7 +65,7 @@ def _load_table(file: Path) -> dict[str, list]:
 
 
 def _dump_table(file: Path, columns: dict[str, list]) -> None:
-    """Keeps the types of columns whose values still have them; the others are of another type, or text."""
+    """Writes a table; columns keep their type if their values still fit it."""
     schema = parquet.read_schema(file)
 
     def column(name: str, values: list) -> pa.Array:
@@ -93,7 +93,7 @@ FORMATS = {
 
 
 def edited(change: d.Change) -> d.Change:
-    """Changes what is in a file; what the change returns takes its place, if that is anything."""
+    """Applies a change to the contents of a file: in place, or by its return value if that is not ``None``."""
 
     def act(file: Path) -> None:
         form = FORMATS[file.suffix]
@@ -108,7 +108,7 @@ def edited(change: d.Change) -> d.Change:
 
 
 def _some(*values: Any, often: int = 4) -> d.Wrong:
-    """Values of which the first are always tried, and one of the others is drawn."""
+    """Returns values: the first ``often`` are always tried, the others are drawn."""
     return d.of(*values[:often], others=st.sampled_from(values[often:]))
 
 
@@ -138,7 +138,7 @@ OBJECTS = {"an object": np.array([{}], dtype=object), "text": np.array("x")}
 
 
 def wrong_of(leaf: Any, text: bool = False) -> d.Wrong:
-    """Returns values that are wrong in a leaf's place."""
+    """Returns wrong values for a leaf."""
     if isinstance(leaf, np.ndarray | torch.Tensor):
         floating = leaf.dtype.kind == "f" if isinstance(leaf, np.ndarray) else leaf.is_floating_point()
         wrong = FLOATS | SHAPES if floating else d.Wrong(SHAPES)
@@ -150,7 +150,7 @@ def wrong_of(leaf: Any, text: bool = False) -> d.Wrong:
 
 
 def places(tree: Any, here: Place = (), rows: int = 3) -> Iterator[tuple[Place, Any]]:
-    """Yields all places of a tree with what stands there; of long lists the first, a middle and the last one."""
+    """Yields all places of a tree with their values; for long lists only first, middle and last."""
     if here:
         yield here, tree
     if isinstance(tree, dict):

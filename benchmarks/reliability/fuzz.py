@@ -1,4 +1,4 @@
-"""The fuzz suite: damaged inputs at every border, and what comes of each."""
+"""The fuzz suite: runs damaged inputs at every interface, and counts the verdicts."""
 
 from __future__ import annotations
 
@@ -21,39 +21,40 @@ from benchmarks.common.tables import head, line
 from benchmarks.reliability.case import Case, Verdict, judge
 from benchmarks.reliability.target import Target
 
-#: Modules of tests/borders, whose cases the tests run, too; then those of benchmarks/reliability/borders.
-TESTED = ("filters_made", "sub_models", "around_filters", "of_files")
-BORDERS = (*TESTED, "arrays", "recorded", "logs", "models", "legged", "commands")
+#: Modules of tests/borders.
+BORDERS = (
+    "filters_made", "sub_models", "around_filters", "readings", "spaces", "noises", "legged", "kitti", "car", "lerobot",
+    "ur5", "recordings", "corners", "caches", "logs", "models", "commands",
+)  # fmt: skip
 KINDS = ("clear", "right", "unclear", "silent", "hang", "crash")
 GOOD = KINDS[:2]
 RESULTS = Path(__file__).parent / "results"
-Row = dict[str, str]  # border, case, kind, what, and how to run it again
+Row = dict[str, str]  # border, case, kind, message, and the options that repeat it
 
 
 def all_targets(borders: Sequence[str] = BORDERS) -> list[Target]:
-    """Returns what may be damaged, in an order of its own."""
-    places = {name: "tests" if name in TESTED else "benchmarks.reliability" for name in borders}
-    modules = [import_module(f"{place}.borders.{name}") for name, place in places.items()]
+    """Returns the targets of some borders, in a fixed order."""
+    modules = [import_module(f"tests.borders.{name}") for name in borders]
     return [target for module in modules for target in module.targets()]
 
 
 def row(case: Case, verdict: Verdict, again: str) -> Row:
-    """Records what came of a case."""
+    """Returns the row of a case with its verdict."""
     return {"border": case.border, "case": case.name, "kind": verdict.kind, "what": verdict.text, "again": again}
 
 
 class Found(AssertionError):
-    """Holds an input that neither raises clearly nor is right."""
+    """Raised for a case whose verdict is neither clear nor right."""
 
 
 def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str) -> list[Row]:
-    """Draws cases; the smallest that is neither clear nor right comes last, with the words that run it again.
+    """Draws cases, and returns their rows; the last is the smallest failing one, if any fails.
 
     Args:
-        cases: what is drawn.
-        count: so many of them, if all are in order.
-        seed: another one draws others.
-        words: of the command line, by which the same cases are drawn again.
+        cases: strategy for cases.
+        count: number of cases, if none fails.
+        seed: of the draws.
+        words: command-line options that repeat the same draws.
     """
     rows: list[Row] = []
 
@@ -83,7 +84,7 @@ def search(cases: st.SearchStrategy[Case], count: int, seed: int, words: str) ->
 
 
 def attacked(target: Target, drawn: int, seed: int) -> list[Row]:
-    """All named cases of a target, and some that are drawn."""
+    """Returns rows of all named cases of a target, and of some random ones."""
     words = f"--match {f'{target.border} {target.name}:'!r} --drawn {drawn} --seed {seed}"
     rows = [row(case, judge(case), f"--match {f'{case.border} {case.name}'!r} --drawn 0") for case in target.named()]
     if drawn and not target.wrong.others.is_empty:
@@ -92,14 +93,14 @@ def attacked(target: Target, drawn: int, seed: int) -> list[Row]:
 
 
 def told(rows: Sequence[Row]) -> None:
-    """Prints what is neither clear nor right, and how to run it again."""
+    """Prints the failing cases, and the commands that repeat them."""
     for one in rows:
         if one["kind"] not in GOOD:
             print(f"{one['kind']}: {one['border']}: {one['case']}: {one['what']}", flush=True)
             print(f"  again: python -m benchmarks.reliability fuzz {one['again']}", flush=True)
 
 
-_WORKS: list[Callable[[], list[Row]]] = []  # which forked processes have from their parent
+_WORKS: list[Callable[[], list[Row]]] = []  # inherited by forked processes
 
 
 def _work(number: int) -> list[Row]:
@@ -107,7 +108,7 @@ def _work(number: int) -> list[Row]:
 
 
 def side_by_side(works: Sequence[Callable[[], list[Row]]], processes: int) -> list[Row]:
-    """The rows of all works, each of which goes to the first process that is free."""
+    """Runs all jobs, each on the first free process, and returns their rows."""
     rows: list[Row] = []
     _WORKS[:], at = works, time.monotonic()
     with multiprocessing.get_context("fork").Pool(processes) as pool:
@@ -121,7 +122,7 @@ def side_by_side(works: Sequence[Callable[[], list[Row]]], processes: int) -> li
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Counts of all, by border, and the cases that are neither clear nor right."""
+    """Returns counts of all cases and by border, and the failing cases."""
 
     def counts(some: Sequence[Row]) -> dict[str, int]:
         kinds = Counter(one["kind"] for one in some)
@@ -133,14 +134,14 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """A summary as Markdown."""
+    """Returns a summary as Markdown."""
     rows = [*found["borders"].items(), ("all", found)]
     lines = [line(name, one["records"], *(one[kind] for kind in KINDS)) for name, one in rows]
     return "\n".join([*head("border", "inputs", *KINDS), *lines, ""])
 
 
 def sampled(targets: Sequence[Target], count: int, seed: int) -> list[Callable[[], list[Row]]]:
-    """Works that draw so many cases, of each border its share, at least one."""
+    """Returns jobs that draw ``count`` cases in all, in proportion to the borders' targets, at least one each."""
 
     def work(border: str) -> list[Row]:
         some = [target for target in targets if target.border == border]
@@ -152,15 +153,15 @@ def sampled(targets: Sequence[Target], count: int, seed: int) -> list[Callable[[
 
 @dataclass(frozen=True)
 class Fuzz:
-    """Runs damaged inputs and counts what comes of them; leaves fuzz.json."""
+    """Runs damaged inputs and counts their verdicts; writes fuzz.json."""
 
-    sample: int = 0  # so many cases, drawn of all; 0 for all that have names, and those that are drawn beside
-    drawn: int = 3  # so many cases beside those with names, of each thing that may be damaged
-    seed: int = 0  # of what is drawn
+    sample: int = 0  # number of random cases over all targets; 0 for all named cases and some random ones
+    drawn: int = 3  # number of random cases of each target, in addition to the named ones
+    seed: int = 0  # of random cases
     borders: some_of(BORDERS) = BORDERS  # type: ignore[valid-type]
-    """where the inputs come in"""
-    processes: int = 2  # that take cases side by side
-    match: str = ""  # only cases that have this in their names
+    """interfaces to test"""
+    processes: int = 2  # that run cases in parallel
+    match: str = ""  # only cases with this in their names
     out: Path = RESULTS / "fuzz.json"
     smoke: bool = False  # a tiny run
 

@@ -1,4 +1,4 @@
-"""Files of somebody with bad intentions: pickles that run code, archives that unpack to more than there is room for."""
+"""Malicious files: pickles that run code, and archives that unpack to more than the available memory."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 import torch
 
-#: What a hostile file makes in the working folder when it gets to run.
+#: Folder that a hostile file makes in the working folder if its code runs.
 MARK = "the-code-ran"
 
 
 class Bomb:
-    """A pickle of it makes a file when it is read."""
+    """An object whose pickle makes the folder ``MARK`` when it is loaded."""
 
     def __reduce__(self):
         return (os.mkdir, (MARK,))
 
     @staticmethod
     def pickled() -> bytes:
-        """The pickle."""
+        """Returns the pickle."""
         return pickle.dumps(Bomb())
 
     @staticmethod
     def npz(name: str) -> bytes:
-        """An archive of arrays, one of them of such objects."""
+        """Returns an archive with an object array that has such an object."""
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=True, **{name: np.array([Bomb()], dtype=object)})
         return buffer.getvalue()
@@ -39,14 +39,14 @@ class Bomb:
 
 @cache
 def npz_of_zeros(size: int) -> bytes:
-    """A small archive with an array of so many bytes."""
+    """Returns a small archive with an array of ``size`` bytes."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, pixels=np.zeros(size, np.uint8))
     return buffer.getvalue()
 
 
 def archive(members: Mapping[str, str | bytes]) -> Callable[[Path], None]:
-    """Writes an archive of these members."""
+    """Returns a function that writes an archive with these members."""
 
     def write(file: Path) -> None:
         with zipfile.ZipFile(file, "w") as out:
@@ -67,13 +67,13 @@ def _saved(content: Any) -> Callable[[Path], None]:
 
 
 def _pickle_in_zip(file: Path) -> None:
-    """Torch's layout, with a pickle of somebody else's."""
+    """Writes a checkpoint in torch's layout with a malicious pickle."""
     torch.save({"format": "torch_denkf.training/1"}, buffer := io.BytesIO())
     members = members_of(buffer)
     archive(members | {name: Bomb.pickled() for name in members if name.endswith("data.pkl")})(file)
 
 
-#: What writes a file in the place of weights.
+#: Payload that writes a file, saved as weights.
 PICKLES: dict[str, Callable[[Path], Any]] = {
     "a pickle": lambda file: file.write_bytes(Bomb.pickled()),
     "torch's pickle of code": _saved(Bomb()),

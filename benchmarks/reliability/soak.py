@@ -1,4 +1,4 @@
-"""Runs that last: a million steps, kills, full disks, many workers."""
+"""Long runs: a million steps, kills, full disks, many workers."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ TITLES = {
 }
 PARTS = tuple(TITLES)
 RESULTS = Path(__file__).parent / "results"
-#: What stays in the JSON file.
+#: Entries that the tables do not show.
 NOT_SHOWN = ("name", "right", "seconds", "message")
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Soak:
-    """Runs parts of the soak; goes on where an earlier run was left. Leaves soak.json and soak.md."""
+    """Runs parts of the soak, resuming an earlier run; writes soak.json and soak.md."""
 
     parts: some_of(PARTS) = PARTS  # type: ignore[valid-type]
-    """what to run"""
+    """parts to run"""
     steps: int = 1_000_000  # of each filter's packaged step
     kills: int = 8  # of each job
     frames: int = 100_000  # of each layout of environments
     seed: int = 0  # of the moments of the kills
-    anew: bool = False  # forget what an earlier run found in these parts
+    anew: bool = False  # discard an earlier run's rows of these parts
     out: Path = RESULTS / "soak.json"
     smoke: bool = False  # a tiny run
 
@@ -74,7 +74,7 @@ class Soak:
         return json.loads(self.out.read_text())["parts"] if self.out.exists() else {}
 
     def _keep(self, part: str, change: Callable[[list[Row]], list[Row]]) -> None:
-        with FileLock(self.out.with_suffix(".lock")):  # parts may run in processes of their own
+        with FileLock(self.out.with_suffix(".lock")):  # parts may run in separate processes
             parts = self._found()
             parts[part] = change(parts.get(part, []))
             rows = [row for some in parts.values() for row in some]

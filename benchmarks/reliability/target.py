@@ -1,4 +1,4 @@
-"""Lists what is attacked: things with arguments, things with files, and the damage that each of them can take."""
+"""Targets of the fuzz suite: arguments, entries and files, with their damage."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from benchmarks.reliability.case import SECONDS, Case
 from benchmarks.reliability.documents import FORMATS, Place, edited, places
 from torch_denkf._arguments import _signature
 
-Right = Callable[[Any], bool] | None  # whether a result is right; ``None`` where there may be none
+Right = Callable[[Any], bool] | None  # whether a result is right; ``None`` if the case must raise
 
 
 @dataclass(frozen=True)
 class Target:
-    """Something that may be wrong.
+    """An argument, entry or file with its wrong values.
 
     Args:
-        border: where it comes in.
-        name: what it is; unique in its border.
+        border: interface of the library.
+        name: of the target; unique in its border.
         words: arguments, keys or files: a clear message has one of them as a word.
-        act: does what a user would do with a wrong value of it, in an empty folder.
+        act: uses a wrong value as a user would, in an empty folder.
         wrong: its wrong values.
-        right: whether a result is right, as the sound part of the input tells; ``None`` where it must raise.
-        rights: ``right`` for some of the values, by their names; or a function that returns it, given name and value.
-        within: s in which it must be over.
-        needs: makes what it starts from, in a process of its own; called once.
-        slow: whether ``needs`` takes so long that small samples leave it out.
-        said: whether a value that is text is a word by itself.
+        right: whether a result is right, judged by the undamaged part of the input; ``None`` if the case must raise.
+        rights: ``right`` for some of the values, by their names; or a function of name and value that returns it.
+        within: time limit in s.
+        needs: makes the undamaged input in a separate process; called once.
+        slow: whether ``needs`` takes so long that small samples skip the target.
+        said: whether a text value also counts as one of ``words``.
     """
 
     border: str
@@ -51,7 +51,7 @@ class Target:
     said: bool = False
 
     def case(self, one: tuple[str, Any]) -> Case:
-        """The input with one of the wrong values."""
+        """Returns the case of one wrong value."""
         what, value = one
         rights = self.rights
         right = rights(what, value) if callable(rights) else rights.get(what, self.right)
@@ -60,7 +60,7 @@ class Target:
         return Case(self.border, name, words, lambda folder: self.act(value, folder), right, self.within)
 
     def matching(self, part: str) -> Target:
-        """With those named cases alone that have this in their names; with all, if it is in its own."""
+        """Returns the target with the named cases that have ``part`` in their names, or all if its own name has it."""
         if part in f"{self.border} {self.name}:":
             return self
         named = {
@@ -69,27 +69,27 @@ class Target:
         return replace(self, wrong=d.Wrong(named, self.wrong.others))
 
     def named(self) -> list[Case]:
-        """Returns those that are always tried."""
+        """Returns the named cases."""
         return [self.case(one) for one in self.wrong.named.items()]
 
     def some(self) -> st.SearchStrategy[Case]:
-        """Any of them."""
+        """Draws any case."""
         return self.wrong.some().map(self.case)
 
     def others(self) -> st.SearchStrategy[Case]:
-        """Any but those that are always tried."""
+        """Draws a case that is not a named one."""
         return self.wrong.others.map(self.case)
 
 
 @dataclass(frozen=True)
 class Source:
-    """Something that is right, a folder or entries, and how it is read; damage is done to a copy.
+    """A valid input, a folder or entries, and its reader; damage is applied to a copy.
 
     Args:
         border: of its targets.
-        sound: makes it.
+        sound: makes the valid input.
         read: reads it.
-        name: begins the names of its targets.
+        name: prefix of its targets' names.
     """
 
     border: str
@@ -98,13 +98,13 @@ class Source:
     name: str = ""
 
     def damaged(self, change: d.Change, folder: Path | None = None, file: str = "", **options: Any) -> Any:
-        """Returns what a user reads of a changed copy.
+        """Returns the result of reading a damaged copy.
 
         Args:
-            change: of entries, or of a file; what it returns takes the place of entries, if that is anything.
+            change: of entries, or of a file; entries are replaced by its return value, if that is not ``None``.
             folder: for the copy; by default one in the working folder.
-            file: the file in the folder that is changed, by default the folder itself.
-            **options: of what reads it.
+            file: the damaged file in the folder, by default the folder itself.
+            **options: of the reader.
         """
         whole = self.sound()
         if isinstance(whole, Path):
@@ -116,11 +116,11 @@ class Source:
         return self.read(whole if changed is None else changed, **options)
 
     def reference(self, **options: Any) -> Any:
-        """Returns what is read without damage, once for all."""
+        """Returns the cached result of reading the undamaged input."""
         return _reference(self, tuple(options.items()))
 
     def like(self, change: d.Change | None = None, near: float = 0.0, **options: Any) -> Callable[[Any], bool]:
-        """Right where a result is that of another change, by default of none; NaN never is."""
+        """Returns a check for the result of another change, by default of none; NaN never passes."""
 
         def right(result: Any) -> bool:
             expected = self.damaged(change, **options) if change else self.reference(**options)
@@ -138,7 +138,7 @@ class Source:
         options: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> Target:
-        """A target whose wrong values are changes of it, or of a file in it; maybe of a single one."""
+        """Returns a target whose wrong values are changes of the input, or of a file in it."""
         words = (words,) if isinstance(words, str) else words
         wrong = {"damaged": wrong} if callable(wrong) else wrong
         wrong = wrong if isinstance(wrong, d.Wrong) else d.Wrong(wrong)
@@ -158,16 +158,16 @@ class Source:
         but: tuple[str, ...] = (),
         **more: Any,
     ) -> Iterator[Target]:
-        """Targets whose wrong values are those of each place of a document.
+        """Yields a target for each place of a document.
 
         Args:
             file: the document.
             right: whether a result is right, in a loose place.
-            words: of clear messages, beside the file's name and the place's.
-            skip: whether a place is left out.
-            loose: whether what stands in a place may be wrong without an error.
-            then: wraps a change of the file, as to adapt a checksum.
-            but: names of values that may be right.
+            words: of clear messages, in addition to the names of the file and the place.
+            skip: whether to skip a place.
+            loose: whether a wrong value in a place may give a result without an error.
+            then: wraps a change of the file, for example to adapt a checksum.
+            but: names of values that may be valid.
             **more: of the targets.
         """
         form, root = FORMATS[Path(file).suffix], self.sound()
@@ -180,7 +180,7 @@ class Source:
                 yield self.target(f"{root.name}/{file}, {'/'.join(named)}", changes, judge, said, file, **more)
 
     def arguments(self, name: str, **more: Any) -> Subject:
-        """Returns what it is read with, as arguments of something by this name."""
+        """Returns the reader's arguments as a subject with this name."""
         return Subject(lambda **given: self.read(self.sound(), **given), name=name, **more)
 
 
@@ -200,7 +200,7 @@ OF_KINDS: dict[str, d.Wrong] = {
     "Callable": d.Wrong({"a number": 3, "text": "sine"}),
     "torch.Generator": d.Wrong({"a seed": 3, "text": "cpu"}),
 }
-#: Likewise, by their names, where they mean the same everywhere.
+#: Wrong values of arguments by name, for names with the same meaning everywhere.
 OF_NAMES: dict[str, d.Wrong] = {
     **dict.fromkeys(("transition", "observation", "noise", "initial", "network", "velocity", "modules"), d.MODULE),
     **dict.fromkeys(("hidden_size", "num_layers", "lags", "longest", "in_features", "out_features"), d.COUNT),
@@ -214,7 +214,7 @@ OF_NAMES: dict[str, d.Wrong] = {
     "process_noise": d.vector(2, negative=False),
     "mean": d.vector(2),
     "loc": d.vector(2),
-    "scale": d.vector(2, positive=True).but("inf"),  # infinity hides an input
+    "scale": d.vector(2, positive=True).but("inf"),  # an infinite scale removes an input
     "std": d.vector(2, negative=False, length=False) | {"too long": [1.0] * 3},
     "ensemble_size": d.LARGE_COUNT,
     "dt": d.POSITIVE.but("text", "zero"),  # text is a key
@@ -225,7 +225,7 @@ OF_NAMES: dict[str, d.Wrong] = {
 
 
 def annotations(make: Callable[..., Any]) -> dict[str, str]:
-    """The arguments that a class or function takes, with their types, as text."""
+    """Returns the arguments of a class or function with their annotations as text."""
     if isinstance(make, type):
         signature, options, _ = _signature(make)
     else:
@@ -235,15 +235,15 @@ def annotations(make: Callable[..., Any]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Subject:
-    """Something with arguments.
+    """A class or function with arguments.
 
     Args:
         make: the class or function.
-        sound: returns right arguments by name.
-        use: what a user would do with what was made, where a mistake may show that the constructor cannot see.
-        wrong: wrong values of arguments, where their names and types do not tell; ``None`` for none.
+        sound: returns valid arguments by name.
+        use: uses the result as a user would, to find mistakes that the constructor cannot detect.
+        wrong: wrong values of arguments, in addition to those by name and annotation; ``None`` for none.
         also: other words by which a message may name an argument.
-        right: for some arguments, whether a result is one that the documentation promises for a wrong value.
+        right: for some arguments, whether a result is the documented one for a wrong value.
         name: for the record.
     """
 
@@ -256,7 +256,7 @@ class Subject:
     name: str = ""
 
     def damage(self) -> dict[str, d.Wrong]:
-        """The wrong values of each argument."""
+        """Returns the wrong values of each argument."""
         found = {}
         for name, text in annotations(self.make).items():
             kind = text.removesuffix(" | None").split("[...")[0]
@@ -267,7 +267,7 @@ class Subject:
         return {name: values for name, values in {**found, **self.wrong}.items() if values is not None}
 
     def targets(self, border: str, **more: Any) -> Iterator[Target]:
-        """A target for every argument."""
+        """Yields a target for every argument."""
         name = self.name or self.make.__qualname__
         for argument, wrong in self.damage().items():
             words = (argument, *self.also.get(argument, ()))
@@ -275,11 +275,11 @@ class Subject:
             yield Target(border, f"{name}({argument})", words, act, wrong, self.right.get(argument), **more)
 
     def act(self, argument: str, value: Any) -> Any:
-        """Makes it with a wrong value, and uses it."""
+        """Calls ``make`` with a wrong value, and uses the result."""
         return self.use(self.make(**{**self.sound(), argument: value}))
 
 
 def targets_of(border: str, *subjects: Subject, **more: Any) -> Iterator[Target]:
-    """The arguments of several subjects."""
+    """Yields the targets of several subjects."""
     for subject in subjects:
         yield from subject.targets(border, **more)

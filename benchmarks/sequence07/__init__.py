@@ -1,1 +1,1 @@
-"""A whole drive of KITTI by stereo corners and turn rates."""
+"""Estimates the path of a whole KITTI drive from stereo corners and turn rates."""

@@ -1,9 +1,9 @@
-"""Finds the numbers of ``chosen.py`` by drive 0022, which has no poses.
+"""Estimates the parameters of ``chosen.py`` from drive 0022, which has no poses.
 
-``python -m benchmarks.sequence07.calibration`` finds first the lens and then the corners' noise, by the likelihood of
-the corners themselves. Then what is wrong for many rows, by halves of the corners and by KITTI's lens. Last the
-filter's noises, by the likelihood of its readings. ``... calibration noises`` finds these alone. Each part starts from
-``chosen.py``: fill in what the parts before have found.
+``python -m benchmarks.sequence07.calibration`` estimates first the lens and then the corners' noise, by the likelihood
+of the corners. Then it estimates the slip, from halves of the corners and from KITTI's lens, and last the filter's
+noises, by the likelihood of its readings. ``... calibration noises`` estimates only the latter. Each part starts from
+``chosen.py``: fill in the results of the parts before.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FOLDER = Path("../shared/data")
 
 
 def _named(values: Tensor) -> tuple[tuple, CornerNoise]:
-    """Lens and noise of numbers ``[10 + 10]``: three of the radius, seven of the disparity, logarithms of the noise."""
+    """Returns lens and noise of ``[10 + 10]`` values: three radial, seven of the disparity, ten logarithms of noise."""
     noise = dict(zip(CORNERS, values[10:].exp().unbind(), strict=True))
     return (values[:3].unbind(), values[3:10].unbind()), CornerNoise(**noise)
 
@@ -39,7 +39,7 @@ def _named(values: Tensor) -> tuple[tuple, CornerNoise]:
 def corner_likelihood(
     values: Tensor, rows: TensorDict, camera: StereoCamera, start: Tensor, steps: int = 3, memory: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """Mean log-likelihood of a corner in the later row, in the tracker's own pixels; and the motions ``[T, 7]``."""
+    """Returns the mean log-likelihood of a corner in the later row, in pixels, and the motions ``[T, 7]``."""
     (radial, short), noise = _named(values)
     lens = replace(camera, radial=radial, disparity_offset=short)
     found = corner_motions(rows, lens, noise, start=start, steps=steps, memory=memory)
@@ -53,7 +53,7 @@ def corner_likelihood(
 
 
 def lens(folder: Path = FOLDER, updates: int = 100) -> None:
-    """The lens by gradients, each row alone: found on the even rows, checked on the odd ones."""
+    """Estimates the lens by gradients, each row alone: fitted on the even rows, checked on the odd ones."""
     found = drive(folder, "0022")
     rows = found.rows[found.rows["motion_observed"].squeeze(-1)]
     before, after = (found.camera.corners(rows["corners"][:, :, row]) for row in (0, 1))
@@ -82,13 +82,13 @@ def lens(folder: Path = FOLDER, updates: int = 100) -> None:
 
 
 def searched(score: Callable[[Tensor], Tensor], values: Tensor, step: float, least: float, rounds: int) -> Tensor:
-    """Maximises by steps: each number up and down by itself, then all that helped together; others' steps are halved.
+    """Maximises by pattern search: tries each value up and down, then all improvements together.
 
     Args:
-        score: of several choices ``[B, N]``: ``[B]``.
-        values: where to start, ``[N]``.
-        step: of each number at first; ends where all are an eighth of it.
-        least: gain that counts as help.
+        score: maps a batch of choices ``[B, N]`` to scores ``[B]``.
+        values: initial values, ``[N]``.
+        step: initial step of each value, halved without an improvement; the search ends when all are below an eighth.
+        least: smallest gain that counts as an improvement.
         rounds: at most.
     """
     steps = torch.full_like(values, step)
@@ -111,7 +111,7 @@ def searched(score: Callable[[Tensor], Tensor], values: Tensor, step: float, lea
 
 @torch.no_grad()
 def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
-    """The corners' noise, with what corners have shown before: found on the first rows, checked on the others."""
+    """Estimates the corners' noise, given their earlier errors: fitted on the first rows, checked on the others."""
     found = drive(folder, "0022")
     camera = calibrated(found.camera)
     before, after = (camera.corners(found.rows["corners"][:, :, row]) for row in (0, 1))
@@ -130,15 +130,15 @@ def corners(folder: Path = FOLDER, rounds: int = 8, rows: int = 400) -> None:
     print(f"other rows {scores(values.unsqueeze(0), slice(rows, None)).item():.4f}")
 
 
-LEAST = 0.3  # m that a row moves; errors are those of each meter
+LEAST = 0.3  # m, least motion of a row; errors are per metre
 
 
 @torch.no_grad()
 def slip(folder: Path = FOLDER, seed: int = 0) -> None:
-    """Errors that last: the corners are split at random, each with all its rows, and each half shows a motion.
+    """Estimates the slip: the corners are split at random over all their rows, and each half gives a motion.
 
-    The mean of both has half the error of their difference. Its square and how much of it is left some rows later are
-    those of a process that forgets a share from row to row, and all where the tracker finds new corners.
+    The error of the halves' mean is half of their difference. Its mean square and its correlation over rows fit a
+    first-order process that is reset when the tracker finds new corners.
     """
     found, random = drive(folder, "0022"), torch.Generator().manual_seed(seed)
     rows, motions = found.rows, []
@@ -169,7 +169,7 @@ def slip(folder: Path = FOLDER, seed: int = 0) -> None:
 
 @torch.no_grad()
 def other_lens(folder: Path = FOLDER) -> None:
-    """Returns what KITTI's lens does to each meter: the lens of another day may be as far off."""
+    """Estimates the error per metre from KITTI's lens, as a measure for the lens of another day."""
     found = drive(folder, "0022")
     lenses = calibrated(found.camera), found.camera
     motions = [corner_motions(found.rows, lens, CornerNoise(**CORNERS)).motion for lens in lenses]
@@ -180,12 +180,12 @@ def other_lens(folder: Path = FOLDER) -> None:
 
 @torch.no_grad()
 def noises(folder: Path = FOLDER, rounds: int = 14) -> None:
-    """The filter's noises, by the log-likelihood of all readings but the first under the extended Kalman filter."""
+    """Estimates the filter's noises by the EKF's log-likelihood of all readings but the first."""
     data, lost = readings(folder, "0022")[0], torch.tensor([name.startswith("kept") for name in FILTER])
     start = torch.tensor(list(FILTER.values()))
 
     def numbers(logs: Tensor) -> Tensor:
-        """Shares that are kept are searched on the scale of what is lost."""
+        """Maps logarithms to values; a decay factor k is searched as the logarithm of 1 - k."""
         return torch.where(lost, (1 - 2.0**logs).clamp(0, 0.999), 2.0**logs)
 
     def likelihoods(tried: Tensor) -> Tensor:

@@ -1,12 +1,12 @@
-"""All numbers of the study that were chosen, each by drive 0022 alone, which has no poses.
+"""All parameters of the study, each estimated from drive 0022 alone, which has no poses.
 
-``python -m benchmarks.sequence07.calibration`` finds them again.
+``python -m benchmarks.sequence07.calibration`` estimates them again.
 """
 
-#: What the lens's rectification has left, and what disparities are short of in pixels: by the likelihood of corners.
+#: Residual radial distortion after rectification, and disparity offsets in pixels, by the likelihood of corners.
 CAMERA = {"radial": (0.004, 0.0256, -0.0099), "disparity_offset": (0.38, 0.382, 0.371, 0.659, -2.033, -3.549, 2.889)}
 
-#: Of corners, by the same likelihood: fields of CornerNoise.
+#: Noise of corners, by the same likelihood: fields of CornerNoise.
 CORNERS = {
     "pixel": 0.0476,
     "pixel_per_flow": 0.0041,
@@ -21,9 +21,9 @@ CORNERS = {
 }
 
 
-#: Of the filters, by the likelihood of their readings: what a row adds to the twist, in rad/s and m/s; which share of
-#: it is kept, and of its last change; what is added to the corners' covariance, times a factor, in rad and m; the
-#: gyro's noise in rad/s.
+#: Noise of the filters, by the likelihood of their readings: process noise of the twist per row, in rad/s and m/s;
+#: decay factors of the twist and of its last change; factor on the corners' covariance, and noise that is added to it,
+#: in rad and m; the gyro's noise in rad/s.
 FILTER = {
     "pitch": 0.0116,
     "yaw": 0.00525,
@@ -45,9 +45,9 @@ FILTER = {
     "gyro": 0.0499,
 }
 
-#: Error of the corners' motion that lasts, in rad/m and m/m, drawn anew where the tracker finds new corners; and which
-#: share is left a row later. HALVES: by how much the motions of two halves of the corners differ. LENS: what the lens
-#: that was found changes of KITTI's, because that of another day is as far off.
+#: Standard deviations of the slip, in rad/m and m/m, which is reset when the tracker finds new corners; and its decay
+#: factor per row. HALVES: from the difference of the motions by two halves of the corners. LENS: from the difference of
+#: the motions with the estimated lens and with KITTI's, as the lens of another day may have such an error.
 HALVES = (0.00015, 0.00017, 0.00023, 0.0058, 0.0045, 0.011)
 LENS = (0.00013, 0.00069, 0.00012, 0.0097, 0.0035, 0.028)
 SLIP_KEPT = 0.957

@@ -1,4 +1,4 @@
-"""The filters: a car's pose, its twist and a gyro's bias, by motions that corners show and by turn rates."""
+"""The filters: a car's pose, its twist and a gyro's bias, from motions of corners and from turn rates."""
 
 from __future__ import annotations
 
@@ -21,31 +21,30 @@ __all__ = ["DT", "POSE", "SPACE", "car_filter", "pose_of", "prepared"]
 
 Kind = Literal["EKF", "UKF", "DEnKF"]
 DT = 0.1037  # s, of a typical row; the length of each is read
-#: Pose of the row before; twist in rad/s and m/s; how turn and speed have changed since the row before; the gyro's bias
+#: Pose of the row before; twist in rad/s and m/s; change of turn rates and speed since the row before; the gyro's bias
 #: in rad/s; the slip in rad/m and m/m.
 SPACE = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3), Euclidean(6))
 WITHOUT_SLIP = Product(SE3(), Euclidean(6), Euclidean(4), Euclidean(3))
 POSE, TWIST, BIAS = slice(0, 7), slice(7, 13), slice(17, 20)
 SLIP = [math.hypot(*both) for both in zip(HALVES, LENS, strict=True)]
-SWAYS = [0, 1, 2, 5]  # of the twist
-SLOW, STILL = 2.0, (0.2, 1.0)  # m/s below which a car turns less, and by what factor
-#: Standard deviations where a filter starts, of all but the slip: from standing still, and from a belief.
+SWAYS = [0, 1, 2, 5]  # components of the twist whose change continues
+SLOW, STILL = 2.0, (0.2, 1.0)  # m/s below which the turn noise is reduced, and the range of the factor
+#: Initial standard deviations, of all but the slip: from rest, and from a belief.
 START = [1e-4] * 6 + [0.2] * 3 + [1.0, 1.0, 10.0] + [0.02] * 3 + [0.1] + [0.01] * 3
 RESTART = [1e-4] * 6 + [0.01] * 3 + [0.05] * 3 + [0.01] * 3 + [0.05] + [0.003] * 3
 
 
 class CarMotion(Motion):
-    """The twist of the row before moves the pose, which so trails by a row, and goes on: a twist is a row's mean.
+    """Motion of pose and twist, with a decaying twist whose changes continue: a car sways, and accelerates for a while.
 
-    A share of the twist is kept, and a share of its last change comes again: a car sways, and speeds up for a while.
-    The pose also moves by the slip, which is what corners do not show of each meter: the same corners are wrong for
-    many rows, until the tracker finds new ones. No sensor reads it, so it changes what a filter claims and not where
-    the filter thinks it is.
+    The twist is the mean over a row. The pose has a delay of one row, so that the row's readings correct the twist
+    before it moves the pose.
 
-    The pose trails so that the row's own readings correct the twist before it moves the pose.
+    The pose also moves by the slip, the error of the corners' motion per metre, which lasts until the tracker finds new
+    corners. No sensor observes it, so that it changes the filter's covariance and not its mean.
 
     Args:
-        slip: whether the state has it.
+        slip: whether the state has the slip.
     """
 
     def __init__(self, slip: bool = True):
@@ -55,7 +54,7 @@ class CarMotion(Motion):
         )
 
     def move(self, state, kept, swing, slip_kept, *, dt):
-        """The pose moved by twist and slip; the twist that is kept."""
+        """Returns the next states: the pose moved by twist and slip, the decayed twist, and its change."""
         pose, twist, change, bias, *slips = self.space.points(state)
         change = swing * change
         after = kept * twist + torch.cat([change[..., :3], torch.zeros_like(twist[..., 3:5]), change[..., 3:]], -1)
@@ -64,20 +63,20 @@ class CarMotion(Motion):
 
 
 class LastMotion(SubModel):
-    """The motion since the row before, ``[*B, E, 7]``: a point of SE3."""
+    """Measurement model of the motion since the row before, ``[*B, E, 7]``: a point of SE3."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "dt"], [("forecast", "observation")])
 
     def compute(self, ensemble, dt):
-        """Tells where the twist leads in the time of a row."""
+        """Returns the motion by the twist over a row."""
         return SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
 
 
 class WhitenedMotion(SubModel):
-    """Tells how far a member's motion is from the reading, ``[*B, E, 6]``, in standard deviations that are independent.
+    """Measurement model of the whitened difference between a member's motion and the reading, ``[*B, E, 6]``.
 
-    An ensemble's update takes variances and no covariance. The reading of this model is zero, with variances of one.
+    An ensemble's update takes variances, not a covariance. The reading of this model is zero, with unit variances.
     """
 
     def __init__(self):
@@ -85,40 +84,40 @@ class WhitenedMotion(SubModel):
         super().__init__(nn.Identity(), keys, [("forecast", "observation")])
 
     def compute(self, ensemble, dt, motion, cov):
-        """The tangent between both motions, by the root of its covariance."""
+        """Returns the tangent between both motions, whitened by the Cholesky factor of its covariance."""
         moved = SE3().exp(ensemble[..., TWIST] * dt.unsqueeze(-2))
         away = SE3().minus(moved, motion.unsqueeze(-2).expand_as(moved))
         return torch.linalg.solve_triangular(torch.linalg.cholesky(cov), away.mT, upper=False).mT
 
 
 class TurnRate(SubModel):
-    """Predicts what the gyro reads, ``[*B, E, 3]`` in rad/s."""
+    """Measurement model of the gyro, ``[*B, E, 3]`` in rad/s."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("forecast", "ensemble")], [("forecast", "observation")])
 
     def compute(self, ensemble):
-        """The twist's turn and the bias."""
+        """Returns the angular velocity plus the gyro bias."""
         return ensemble[..., TWIST][..., :3] + ensemble[..., BIAS]
 
 
 class Given(Sensor):
-    """Hands the first components of an entry on, under another key."""
+    """Copies the first components of an entry to another key."""
 
     def __init__(self, in_key, out_key, size: int):
         super().__init__(nn.Identity(), [in_key], [out_key])
         self.observation_dim = size
 
     def compute(self, value):
-        """The same."""
+        """Returns the first components."""
         return value[..., : self.observation_dim]
 
 
 def pose_of(out: TensorDict, prefix: str = "belief") -> tuple[Tensor, Tensor]:
-    """Poses ``[*B, T - 1, 7]`` and their variances ``[*B, T - 1, 6]``, of each row but the last.
+    """Returns poses ``[*B, T - 1, 7]`` and their variances ``[*B, T - 1, 6]``, of each row but the last.
 
     Args:
-        out: of a filter's sequence, ``[*B, T]``. The pose trails, so that of a row is forecast for the next one.
+        out: of a filter's sequence, ``[*B, T]``. The pose has a delay of one row, so it is read from the next forecast.
         prefix: ``"belief"`` or ``"smoothed"``.
     """
     prefix = "forecast" if prefix == "belief" else prefix
@@ -142,7 +141,7 @@ def noise_paths(slip: bool = True) -> Tensor:
 
 
 def speed_before(data: TensorDict) -> Tensor:
-    """The last speed that corners have shown before each row, ``[*B, T, 1]`` in m/s."""
+    """Returns the last speed from corners before each row, ``[*B, T, 1]`` in m/s."""
     rows = torch.arange(data.shape[-1]).unsqueeze(-1)
     last = torch.where(data["motion_observed"], rows, 0).cummax(-2).values
     last = torch.cat([last[..., :1, :], last[..., :-1, :]], -2)
@@ -150,12 +149,12 @@ def speed_before(data: TensorDict) -> Tensor:
 
 
 def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | None = None) -> TensorDict:
-    """Readings with the noises that a filter is to believe.
+    """Returns readings with the noise covariances of the filter.
 
     Args:
         readings: ``[*B, T]``.
-        values: as ``chosen.FILTER``; each number may be ``[B]``, so that a batch tries several.
-        start: state of the first row, with its own pose, ``[*B, 26]``; by default at the origin, standing still.
+        values: as ``chosen.FILTER``; each value may be ``[B]``, so that a batch tries several.
+        start: state of the first row, with its own pose, ``[*B, 26]``; by default at rest at the origin.
     """
     values = FILTER if values is None else values
     data = readings.clone()
@@ -168,7 +167,7 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
         return (numbers.unsqueeze(-2) if numbers.ndim > 1 else numbers).expand(*data.shape, len(names))
 
     walks = several("pitch", "yaw", "roll", "side", "down", "ahead").clone()
-    walks[..., :5] *= (speed_before(data) / SLOW).clamp(*STILL)  # a car that stands does not turn
+    walks[..., :5] *= (speed_before(data) / SLOW).clamp(*STILL)  # a car at rest does not turn
     bias = torch.full_like(walks[..., :3], 1e-5)
     seen_before = data["motion_observed"].roll(1, -2)
     data["slip_kept"] = torch.where(seen_before, SLIP_KEPT, 0.0)  # the tracker has found new corners
@@ -189,13 +188,13 @@ def prepared(readings: TensorDict, values: dict | None = None, start: Tensor | N
 
 
 def car_filter(kind: Kind, members: int = 64, *, again: bool = False, slip: bool = True, **analysis) -> Filter:
-    """A filter of all three parts of the state.
+    """Returns a filter of the whole state.
 
     Args:
         kind: of filter.
         members: of the ensemble.
-        again: whether the start is a belief of a filter that has run before.
-        slip: whether the state of an ensemble has it.
+        again: whether the initial state is a belief of a filter that has run before.
+        slip: whether the state of an ensemble has the slip.
         **analysis: options of the ensemble's analyses.
     """
     seen = {"observed_key": "motion_observed"}

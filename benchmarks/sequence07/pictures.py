@@ -1,4 +1,4 @@
-"""The path from above, the error over the length of a segment, and what intervals hold."""
+"""Draws the path from above, the error over the length of a segment, and the coverage of intervals."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 
 __all__ = ["draw"]
 
-CONDITION = "as it is"
+CONDITION = "recorded"
 LENGTHS = (100, 200, 300, 400, 500, 600)  # m; the drive has 695
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 
 
 def draw(paths: Mapping, claims: Mapping, poses: Tensor, steps: Sequence[int], file: Path) -> None:
-    """Draws the drive as it is.
+    """Draws the drive as recorded.
 
     Args:
         paths: by condition and filter, ``[T, 7]``.
-        claims: by condition and filter, of relative motions.
+        claims: relative motions with variances, by condition and filter.
         poses: true ones, ``[T, 7]``.
         steps: rows of the relative motions.
         file: PNG.
@@ -47,7 +47,7 @@ def draw(paths: Mapping, claims: Mapping, poses: Tensor, steps: Sequence[int], f
             for at, step in enumerate(steps):
                 claimed.plot(LEVELS, held[:, at], f"C{at}{marker}-", lw=1, ms=4, label=f"{name}, {step} rows")
     claimed.plot([0, 1], [0, 1], "k--", lw=1)
-    claimed.set(xlabel="claimed", ylabel="held", title="relative motion: intervals")
+    claimed.set(xlabel="nominal", ylabel="coverage", title="relative motion: intervals")
     for axis in (above, along, claimed):
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)

@@ -24,8 +24,8 @@ from torch_denkf.functional.manifolds import SE3
 from torch_denkf.smoothers import EnRTS, RTSSmoother
 
 LEVEL = 0.9  # of the intervals
-STEPS = (1, 10, 100)  # rows over which a relative motion is claimed
-EVERY = 40  # rows from one start of a relative motion to the next
+STEPS = (1, 10, 100)  # rows of the relative motions
+EVERY = 40  # rows between two starts of relative motions
 HELD = tuple(f"held_{step}" for step in STEPS)
 DRAWS = 5  # of an ensemble
 SPREADS = ("translation_spread", "rotation_spread")  # standard deviation over draws
@@ -34,17 +34,17 @@ SCORES = ("translation", "rotation", *HELD, "ms", *SPREADS)
 
 @dataclass(frozen=True)
 class Study:
-    """Measures how far off a car is that sees stereo corners and turn rates, on KITTI's odometry sequence 07."""
+    """Measures the path error of a car with stereo corners and turn rates, on KITTI's odometry sequence 07."""
 
     data: Path = Path("../shared/data")  # with kitti_inertial/0027.npz and kitti/poses/07.txt
     out: Path | None = None  # folder for sequence07.csv, sequence07.md and sequence07.png
     seed: int = 0
-    ukf: bool = False  # also the unscented filter, whose figures are the extended one's
+    ukf: bool = False  # also the UKF, whose results equal the EKF's
     smoke: bool = False  # a few rows and filters: does it run?
 
 
 class Claim(NamedTuple):
-    """Relative motions that a filter has found, and their variances.
+    """Relative motions by a filter, with their variances and the truth.
 
     Attributes:
         mean: points of SE3, ``[*B, K, 7]``.
@@ -57,25 +57,25 @@ class Claim(NamedTuple):
     truth: Tensor
 
     def away(self) -> Tensor:
-        """The tangent's errors, in standard deviations, ``[*B, K, 6]``."""
+        """Returns the tangent's errors, in standard deviations, ``[*B, K, 6]``."""
         return SE3().minus(self.truth, self.mean) / self.var.sqrt()
 
     def held(self, level: float = LEVEL) -> Tensor:
-        """Share of the tangent's components within the intervals of that level, ``[K]``."""
+        """Returns the coverage of the tangent's intervals at a level, ``[K]``."""
         inside = self.away().abs() <= NormalDist().inv_cdf((1 + level) / 2)
         return inside.double().mean(-1).flatten(0, -2).mean(0)
 
 
 def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict, Tensor]:
-    """Sequences that start from a pose that is known.
+    """Returns windows that start from a known pose.
 
     Args:
-        data: what a filter reads, ``[C, T]``.
-        states: means of a filter that has read it, ``[C, T, 26]``. A window starts from its twist.
+        data: a filter's inputs, ``[C, T]``.
+        states: means of a filter over the whole drive, ``[C, T, 26]``. A window starts from its twist.
         poses: true poses ``[T, 7]``.
 
     Returns:
-        What a filter reads from each start on, ``[C, W, K]`` with K two more than the last of ``STEPS``, and the true
+        A filter's inputs in each window, ``[C, W, K]`` with K two more than the last of ``STEPS``, and the true
         motions since the start ``[W, K, 7]``.
     """
     length = STEPS[-1] + 2
@@ -84,7 +84,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
     origin = SPACE.neutral(states).expand(len(states), len(first), -1).clone()
     origin[..., POSE.stop : BIAS.stop] = states[:, first, POSE.stop : BIAS.stop]
     part = prepared(data[:, rows], start=origin)
-    for key in ("motion_observed", "gyro_observed"):  # the start's own reading is in its belief
+    for key in ("motion_observed", "gyro_observed"):  # the first reading is in the initial belief already
         part[key] = part[key].clone()
         part[key][:, :, 0] = False
     true = poses[rows]
@@ -92,7 +92,7 @@ def windows(data: TensorDict, states: Tensor, poses: Tensor) -> tuple[TensorDict
 
 
 def claimed(out: TensorDict, true: Tensor, prefix: str = "belief") -> Claim:
-    """Returns what a filter claims of windows ``[W, K]``, over each of ``STEPS``."""
+    """Returns a filter's relative motions in windows ``[W, K]``, over each of ``STEPS``."""
     mean, var = pose_of(out, prefix)
     at = torch.tensor(STEPS)
     return Claim(mean[:, at], var[:, at], true[:, at])
@@ -100,14 +100,14 @@ def claimed(out: TensorDict, true: Tensor, prefix: str = "belief") -> Claim:
 
 @torch.no_grad()
 def run(model: Filter, data: TensorDict) -> TensorDict:
-    """Returns what the study needs of what is written, from the same seed."""
+    """Runs a filter with a fixed seed, and returns the entries that the study needs."""
     torch.manual_seed(0)
     wanted = {("belief", "mean"), ("forecast", "mean"), ("forecast", "cov"), ("forecast", "ensemble")}
     return model.sequence(data.clone(), keep=[key for key in model.out_keys if key in wanted])
 
 
 def and_one_more(data: TensorDict) -> TensorDict:
-    """Rows ``[C, T + 1]``: one more, in which nothing is read."""
+    """Appends a row without readings: ``[C, T + 1]``."""
     last = data[:, -1:].clone()
     for key in ("motion_observed", "gyro_observed"):
         last[key] = torch.zeros_like(last[key])
@@ -117,9 +117,9 @@ def and_one_more(data: TensorDict) -> TensorDict:
 def filter_rows(
     label: str, kind: str, data: TensorDict, poses: Tensor, smoother: str = "", **options
 ) -> Iterator[tuple[dict, Tensor, Claim]]:
-    """Yields a row for each condition, its path ``[T, 7]`` and its claim, of a filter, and of its smoother if named.
+    """Yields rows, paths ``[T, 7]`` and relative motions for each condition, of a filter and of its smoother if named.
 
-    An ensemble's row is the mean over ``DRAWS``; the path is that of the first.
+    An ensemble's row is the mean over ``DRAWS``; the path is that of the first draw.
     """
     around = EnRTS if kind == "DEnKF" else RTSSmoother
     draws = DRAWS if kind == "DEnKF" else 1
@@ -150,13 +150,13 @@ def filter_rows(
 
 
 def drift(path: Tensor, poses: Tensor) -> dict[str, float]:
-    """The official errors: % and degrees in 100 m."""
+    """Returns the official errors: % and degrees in 100 m."""
     error = kitti_devkit_error(path, poses)
     return {"translation": error.translation.item(), "rotation": 100 * error.rotation.item()}
 
 
 def alone(study: Study, data: TensorDict, poses: Tensor, count: int) -> Iterator[tuple[dict, Tensor]]:
-    """Rows and paths without a filter: motions one after the other, the last one held where none is seen."""
+    """Yields rows and paths of chained motions without a filter, with zero-order hold for missing motions."""
     for number, condition in enumerate(CONDITIONS):
         seen = data[number]["motion_observed"].squeeze(-1)
         motions, found = naive(study.data, "0027", condition, count, study.seed)
@@ -169,16 +169,16 @@ def alone(study: Study, data: TensorDict, poses: Tensor, count: int) -> Iterator
 
 
 def page(rows: Sequence[dict], count: int) -> str:
-    """The table."""
+    """Returns the table."""
     lines = [
         "# Sequence 07 of KITTI",
         "",
         f"Odometry sequence 07, {count} rows: stereo corners and turn rates. Errors are KITTI's own, in six "
-        f"dimensions, over 100 to 800 m. *Held*: the share of errors within the {LEVEL:.0%} intervals, of the six "
-        f"numbers of the motion over 1, 10 and 100 rows; a start every {EVERY} rows. Rows of ensembles are means over "
-        f"{DRAWS} draws, with their standard deviation.",
+        f"dimensions, over 100 to 800 m. *Coverage*: the share of errors within the {LEVEL:.0%} intervals, for "
+        f"the six components of the motion over 1, 10 and 100 rows; a reset every {EVERY} rows. Rows of ensembles are "
+        f"means over {DRAWS} seeds, with their standard deviation.",
     ]
-    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"held, {step}" for step in STEPS), "ms a row")
+    titles = ("filter", "translation, %", "rotation, deg/100 m", *(f"coverage, {step}" for step in STEPS), "ms per row")
     for condition in CONDITIONS:
         lines += ["", f"## {condition.capitalize()}", "", *head(*titles)]
         for row in rows:
@@ -190,11 +190,11 @@ def page(rows: Sequence[dict], count: int) -> str:
                 lines.append(line(row["filter"], *numbers))
     lines += [
         "",
-        "*Corners lost*: none for 10 rows in each 100. *Wrong corners*: 20 % of the corners are up to 30 pixels off in "
-        "the later row, in both images by different amounts.",
+        "*Dropout*: no corners for 10 rows in each 100. *Outliers*: 20 % of the corners of the later row have an error "
+        "of up to 30 pixels, different in both images.",
         "",
-        "Milliseconds are those of the processor for one row of one drive, not compiled, one thread; without those of "
-        "the corners' motion.",
+        "Milliseconds are processor time for one row of one drive, not compiled, one thread. The estimation of the "
+        "corners' motion is not included.",
         "",
         *made_by("sequence07"),
     ]

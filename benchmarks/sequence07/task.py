@@ -1,4 +1,4 @@
-"""Two drives of KITTI as rows that a filter reads: sequence 07, and one without poses by which all is chosen."""
+"""Two drives of KITTI as rows of readings: sequence 07, and a drive without poses for the choice of all settings."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from torch_denkf.functional.manifolds import SE3, quaternion_of
 __all__ = ["CONDITIONS", "ROWS", "Condition", "chained", "drive", "naive", "readings", "truth"]
 
 ROWS = 1101  # of the raw drive that sequence 07 has
-Condition = Literal["as it is", "corners lost", "wrong corners"]
+Condition = Literal["recorded", "dropout", "outliers"]
 CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 LOST, EVERY = 10, 100  # rows without corners, 1 s, in each 10 s
-WRONG, OFF = 0.2, 30.0  # share of wrong corners; how far off they are, in pixels, uniformly in each direction
+WRONG, OFF = 0.2, 30.0  # share of outliers; their largest error in each direction, in pixels, uniformly distributed
 
 
 @dataclass(frozen=True)
@@ -40,24 +40,24 @@ class Drive:
 
 @cache
 def drive(folder: Path, name: str, count: int | None = None) -> Drive:
-    """Rows of ``kitti_inertial/NAME.npz`` in a folder, and its camera as it is calibrated."""
+    """Returns the rows of ``kitti_inertial/NAME.npz`` in a folder, and its calibrated camera."""
     return Drive(*read_corner_drive(folder / "kitti_inertial" / f"{name}.npz", count))
 
 
 @cache
 def truth(folder: Path, count: int = ROWS) -> Tensor:
-    """Official poses of sequence 07, ``[T, 7]``, of the left camera."""
+    """Returns the official poses of sequence 07, ``[T, 7]``, of the left camera."""
     poses = torch.as_tensor(read_poses(folder / "kitti" / "poses" / "07.txt"), dtype=torch.float64)[:count]
     return torch.cat([quaternion_of(poses[:, :3, :3]), poses[:, :3, 3]], -1)
 
 
 def calibrated(camera: StereoCamera) -> StereoCamera:
-    """A camera with what was found of its lens and of the tracker."""
+    """Returns the camera with the estimated lens distortion and disparity offset."""
     return replace(camera, radial=CAMERA["radial"], disparity_offset=CAMERA["disparity_offset"])
 
 
-def with_wrong_corners(rows: TensorDict, seed: int) -> TensorDict:
-    """Rows in which some corners are elsewhere in the later row, in both images by different amounts."""
+def with_outliers(rows: TensorDict, seed: int) -> TensorDict:
+    """Returns rows in which some corners of the later row are displaced, by different amounts in both images."""
     random = torch.Generator().manual_seed(seed)
     wrong = torch.rand(rows["seen"].shape, generator=random) < WRONG
     away = OFF * (2 * torch.rand(*wrong.shape, 4, generator=random, dtype=torch.float64) - 1)
@@ -67,10 +67,10 @@ def with_wrong_corners(rows: TensorDict, seed: int) -> TensorDict:
 
 
 def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDict:
-    """Rows as they are, or with what happens to their corners."""
-    if condition == "wrong corners":
-        return with_wrong_corners(rows, seed)
-    if condition == "corners lost":
+    """Returns the recorded rows, or rows with outliers or dropout of the corners."""
+    if condition == "outliers":
+        return with_outliers(rows, seed)
+    if condition == "dropout":
         rows = rows.clone()
         there = (torch.arange(len(rows)) % EVERY < EVERY - LOST).unsqueeze(-1)
         rows["seen"] &= there
@@ -81,9 +81,9 @@ def in_condition(rows: TensorDict, condition: Condition, seed: int) -> TensorDic
 def readings(
     folder: Path, name: str, conditions: Sequence[Condition] = ("as it is",), count: int | None = None, seed: int = 0
 ) -> TensorDict:
-    """Returns what a filter reads in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
+    """Returns a filter's inputs in each condition, ``[C, T]``: motion with covariance, turn rates, masks, time steps.
 
-    The camera triggers regularly, and its stamps tremble by a millisecond: each row is given the median step.
+    The camera triggers regularly, and its stamps have a jitter of a millisecond, so that each row has the median step.
     """
     found = drive(folder, name, count)
     rows = torch.stack([in_condition(found.rows, condition, seed) for condition in conditions])
@@ -98,7 +98,7 @@ def readings(
 
 
 def naive(folder: Path, name: str, condition: Condition, count: int | None = None, seed: int = 0):
-    """OpenCV's pose from corners, refined, with the camera as KITTI calibrates it: motions ``[T, 7]``, and a mask."""
+    """Returns OpenCV's refined motions ``[T, 7]`` from corners with KITTI's calibration, and their observed mask."""
     found = drive(folder, name, count)
     rows, camera = in_condition(found.rows, condition, seed), found.camera
     matrix = np.array([[camera.focal, 0, camera.center[0]], [0, camera.focal, camera.center[1]], [0, 0, 1.0]])
@@ -121,7 +121,7 @@ def naive(folder: Path, name: str, condition: Condition, count: int | None = Non
 
 
 def chained(motions: Tensor, seen: Tensor, dt: Tensor) -> Tensor:
-    """A path ``[T, 7]`` of motions ``[T, 7]``; where one is not seen, the last velocity is held."""
+    """Returns a path ``[T, 7]`` of chained motions ``[T, 7]``, with zero-order hold for missing motions."""
     path, twist = [SE3().neutral(motions)], motions.new_zeros(6)
     twists = SE3().log(motions) / dt
     for row in range(1, len(motions)):

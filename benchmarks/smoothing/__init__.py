@@ -1,1 +1,1 @@
-"""Smoothers on chaotic systems, beside DAPPER."""
+"""Evaluates smoothers on chaotic systems, compared with DAPPER, and with trained sensors."""

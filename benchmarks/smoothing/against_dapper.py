@@ -1,4 +1,4 @@
-"""The same truth and the same readings through DAPPER, where it is installed."""
+"""Runs DAPPER, if it is installed, on the same truth and the same readings."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from benchmarks.smoothing.systems import SYSTEMS, simulate
 
 
 def installed() -> bool:
-    """Tells whether DAPPER is there."""
+    """Returns whether DAPPER is installed."""
     return importlib.util.find_spec("dapper") is not None
 
 
 def rows(case: Case, seed: int, cycles: int) -> list[dict]:
-    """DAPPER's row of one seed."""
+    """Returns DAPPER's row for one seed."""
     import dapper.da_methods as methods
     import dapper.mods as modelling
     from dapper.dpr_config import rc
@@ -37,7 +37,7 @@ def rows(case: Case, seed: int, cycles: int) -> list[dict]:
     if case.method == "EnKS":
         method = methods.EnKS(update, Lag=case.lag, **members, **tuning)
     elif case.method == "EnRTS":
-        # Its small steps are many: a factor of 0.99 on each gain, as in DAPPER's own settings of Lorenz-96.
+        # DAPPER's own settings of Lorenz-96 multiply each of the many small steps' gains by 0.99.
         method = methods.EnRTS(update, DeCorr=0.99 if case.system == "lorenz96" else 1.0, **members, **tuning)
     elif case.method == "IEnKS":
         method = methods.iEnKS("Sqrt", rot=True, **members, **tuning)

@@ -13,12 +13,12 @@ class Case:
         system: a key of ``SYSTEMS``.
         method: ``"EnKS"``, ``"EnRTS"``, ``"IEnKS"`` or ``"particles"``.
         ensemble_size: members or particles.
-        lag: cycles; ``None`` for all that come later.
+        lag: cycles; ``None`` for all later ones.
         inflation: factor on the analysis anomalies.
         scheme: of the analysis.
         damping: of EnRTS, in each cycle.
-        jitter: of the particles.
-        ess_threshold: likewise.
+        jitter: of the particle filter.
+        ess_threshold: of the particle filter.
     """
 
     system: str
@@ -32,12 +32,12 @@ class Case:
     ess_threshold: float | None = None
 
     def labels(self) -> dict:
-        """Returns what tells this case's rows from others'."""
+        """Returns the labels of the case's rows."""
         return {"system": self.system, "method": self.method, **({} if self.lag is None else {"lag": self.lag})}
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Returns a name for files."""
         return f"{self.system}-{self.method}-{'all' if self.lag is None else self.lag}"
 
 

@@ -1,7 +1,7 @@
-"""A linear Gaussian model of each quantity, fitted on the recordings for choices; the library's Kalman filter of it.
+"""A linear Gaussian model of each quantity, fitted on validation recordings, and the library's Kalman filter for it.
 
-A quantity x walks, its change c does, too, and goes back to none; where a target u is sent, x goes a share of the way
-there. The sensor reads x + b with white noise; b is the slow part of its error.
+A quantity x is a random walk with a rate c, which decays to zero; if a target u is sent, x moves a share of the
+distance to it. The sensor reads x + b with white noise; the bias b is the slow part of its error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch_denkf.filters import KalmanFilter
 from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.functional.smoothing.rts import rts_smooth
 
-Parameters = dict[str, Tensor]  # of each quantity, [D]: logarithms of standard deviations, logits of shares
+Parameters = dict[str, Tensor]  # for each quantity, [D]: logarithms of standard deviations, logits of shares
 
 
 class Series(NamedTuple):
@@ -29,7 +29,7 @@ class Series(NamedTuple):
         truth: ``[N, T, D]``.
         reading: the mean of the sensor's samples, ``[N, T, D]``.
         observed: ``[N, T, 1]``.
-        target: sent at each time, ``[N, T, D]``; ``None`` for none.
+        target: command at each time, ``[N, T, D]``; ``None`` for none.
     """
 
     truth: Tensor
@@ -39,7 +39,7 @@ class Series(NamedTuple):
 
 
 class Model(NamedTuple):
-    """F, B, Q and R of each quantity, and the covariance of the first state [x, c, b] around the usual x."""
+    """F, B, Q and R of each quantity, and mean and covariance of the first state [x, c, b]."""
 
     transition: Tensor  # [D, 3, 3]
     control: Tensor  # [D, 3, 1]
@@ -49,12 +49,12 @@ class Model(NamedTuple):
     cov: Tensor  # [D, 3, 3]
 
 
-WINDOW, BURN_IN = 60, 10  # steps of a recording that are fitted at once, and of these the first that do not count
+WINDOW, BURN_IN = 60, 10  # steps of a window in the fit, and its first steps, which are not scored
 OBSERVATION = torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 def model_of(parameters: Parameters, series: Sequence[Series]) -> Model:
-    """The matrices; the usual x is that of the series."""
+    """Returns the matrices; the mean of the first x is that of the series."""
     p = parameters
     keeps_change, keeps_error, share = (p[name].sigmoid() for name in ("keeps_change", "keeps_error", "share"))
     walk, change, error, white = (p[name].exp().square() for name in ("walk", "change", "error", "white"))
@@ -75,7 +75,7 @@ def model_of(parameters: Parameters, series: Sequence[Series]) -> Model:
 
 
 def believe(model: Model, series: Series, lag: int) -> tuple[Tensor, Tensor]:
-    """Means of x, filtered and smoothed, ``[N, T, D]``; the gradient goes through."""
+    """Returns differentiable means of x, filtered and smoothed, ``[N, T, D]``."""
     count, steps, size = series.truth.shape
     mean, cov = model.mean.expand(count, size, 3), model.cov.expand(count, size, 3, 3)
     transition, process = (value.expand(count, size, 3, 3) for value in (model.transition, model.noise))
@@ -97,7 +97,7 @@ def believe(model: Model, series: Series, lag: int) -> tuple[Tensor, Tensor]:
 
 
 def fit(series: Sequence[Series], lag: int, updates: int) -> Parameters:
-    """The parameters whose beliefs of x are nearest to the truth, with ``lag`` later readings; 0 fits a filter."""
+    """Returns the parameters with the least error of x, given ``lag`` later readings; a lag of 0 fits a filter."""
     steps = torch.cat([each.truth.diff(dim=1).flatten(0, 1) for each in series]).square().mean(0).sqrt()
     errors = torch.cat([(each.reading - each.truth)[:, 1:].flatten(0, 1) for each in series]).square().mean(0).sqrt()
     zero = torch.zeros_like(steps)
@@ -125,7 +125,7 @@ def fit(series: Sequence[Series], lag: int, updates: int) -> Parameters:
 
 
 def windows_of(series: Series) -> Series:
-    """The same as shorter recordings; what is left over at the end is not used."""
+    """Cuts recordings into windows; the remainder at the end is dropped."""
     steps = series.truth.shape[1]
     length = min(WINDOW, steps)
 
@@ -136,7 +136,7 @@ def windows_of(series: Series) -> Series:
 
 
 def kalman_filter(model: Model) -> KalmanFilter:
-    """The library's filter of all quantities; the state is [x, c, b] of the first, of the second, ..."""
+    """Returns the library's filter of all quantities; the state is [x, c, b] of the first, of the second, ..."""
 
     def joined(value: Tensor) -> Tensor:
         return torch.block_diag(*value)

@@ -18,7 +18,7 @@ BELIEF, SMOOTHED = ("belief", "mean"), ("smoothed", "mean")
 
 
 def make_filter(case: Case) -> Filter:
-    """The filter of a case."""
+    """Returns the filter of a case."""
     system = SYSTEMS[case.system]
     size = len(system.mean)
     parts = {
@@ -37,9 +37,9 @@ def make_filter(case: Case) -> Filter:
 
 
 def estimates(case: Case, readings: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of all cycles, filtered and smoothed, ``[seeds, cycles, N]`` each.
+    """Returns means of all cycles, filtered and smoothed, ``[seeds, cycles, N]`` each.
 
-    The smoothed are those of the cycles that have ``lag`` later ones.
+    The smoothed means are those of the cycles with ``lag`` later ones.
     """
     torch.manual_seed(0)
     frames, filter = frames_of(readings), make_filter(case)
@@ -51,12 +51,12 @@ def estimates(case: Case, readings: Tensor) -> tuple[Tensor, Tensor]:
         return out[BELIEF][:, 1:], out[BELIEF][:, :0]
     lag = case.lag or 1
     running = filter if case.method == "IEnKS" else FixedLag(filter, lag)
-    out = running.sequence(frames, keep=[BELIEF, SMOOTHED])  # what is said of a cycle stands at that lag later
+    out = running.sequence(frames, keep=[BELIEF, SMOOTHED])  # the smoothed mean of a cycle is stored lag cycles later
     return out[BELIEF][:, 1:], out[SMOOTHED][:, 1 + lag :]
 
 
 def rows(case: Case, seeds: Sequence[int], cycles: int) -> list[dict]:
-    """One row a seed."""
+    """Returns one row for each seed."""
     torch.set_default_dtype(torch.float64)
     system = SYSTEMS[case.system]
     path, readings = simulate(system, seeds, cycles)

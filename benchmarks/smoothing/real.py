@@ -1,4 +1,4 @@
-"""Smoothers behind trained sensors, on recordings: the errors of filter and smoother on the same frames."""
+"""Smoothers with trained sensors, on recordings: the errors of filter and smoother on the same frames."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ BELIEF, SMOOTHED = ("belief", "mean"), ("smoothed", "mean")
 
 
 def mean_square(mean: Tensor, truth: Tensor) -> Tensor:
-    """Over the times that have a reading before and ``LAG`` later ones, ``[N, D]``."""
+    """Returns mean square errors ``[N, D]`` over the times with a reading before and ``LAG`` later ones."""
     return (mean - truth)[:, 1:-LAG].square().mean(1)
 
 
 def rows_of(task: Task, group: str, names: str, before: Tensor, after: Tensor, **more) -> list[dict]:
-    """A row for each recording and quantity, from mean squares ``[N, D]`` of filter and smoother."""
+    """Returns a row for each recording and quantity, from mean squares ``[N, D]`` of filter and smoother."""
     recordings = names.split() if len(names.split()) == len(before) else [names]
     if len(recordings) < len(before):
         before, after = before.mean(0, keepdim=True), after.mean(0, keepdim=True)
@@ -54,7 +54,7 @@ def rows_of(task: Task, group: str, names: str, before: Tensor, after: Tensor, *
 
 @torch.no_grad()
 def ensembles(make: Callable[[], Task], place: int, readings: Path, draws: int) -> list[dict]:
-    """The trained filter with its ensemble smoothers, for one number of members."""
+    """Returns rows of the trained filter with its ensemble smoothers, for one number of members."""
     task, rows = make(), []
     members = task.members[place]
     filter = task.behind(task.model(members))
@@ -74,7 +74,7 @@ def ensembles(make: Callable[[], Task], place: int, readings: Path, draws: int) 
 
 
 def series_of(task: Task, batches: Group) -> dict[str, Series]:
-    """The scored quantities of a group, in double precision."""
+    """Returns the scored quantities of a group, in double precision."""
     out = {}
     for names, batch in batches.items():
         reading = batch["sensor", "ensemble"].mean(-2).double()
@@ -85,7 +85,7 @@ def series_of(task: Task, batches: Group) -> dict[str, Series]:
 
 
 def gaussians(make: Callable[[], Task], readings: Path, updates: int) -> list[dict]:
-    """The Kalman filter behind the same sensor, and its smoother; how large and how slow the sensor's errors are."""
+    """Returns rows of the Kalman filter and its smoother, with size and correlations of the sensor's errors."""
     task, rows = make(), []
     groups = {name: series_of(task, each) for name, each in task.groups(task.members[0], readings).items()}
     chosen = list(groups["validation"].values())
@@ -108,7 +108,7 @@ def gaussians(make: Callable[[], Task], readings: Path, updates: int) -> list[di
 
 @torch.no_grad()
 def kalman(model: gaussian.Model, series: Series) -> tuple[Tensor, Tensor]:
-    """Mean squares of the library's filter and smoother, ``[N, D]``."""
+    """Returns the mean squares of the library's filter and smoother, ``[N, D]``."""
     data = {"observation": series.reading, "observed": series.observed}
     data["action"] = torch.zeros_like(series.truth) if series.target is None else series.target
     frames = TensorDict(data, series.truth.shape[:2])
@@ -118,7 +118,7 @@ def kalman(model: gaussian.Model, series: Series) -> tuple[Tensor, Tensor]:
 
 
 def correlation(error: Tensor, lag: int) -> Tensor:
-    """Of errors ``[N, T, D]`` with those ``lag`` steps later, ``[N, D]``."""
+    """Returns the correlation of errors ``[N, T, D]`` with those ``lag`` steps later, ``[N, D]``."""
     return (error[:, lag:] * error[:, :-lag]).mean(1) / error.square().mean(1)
 
 
@@ -126,14 +126,14 @@ Jobs = dict[Path, Callable[[], list[dict]]]
 
 
 def jobs(root: Path | None, out: Path, smoke: bool) -> Jobs:
-    """Returns what writes which file, each on its own."""
+    """Returns independent jobs by the file of their rows."""
     made: Jobs = {}
     large: Jobs = {}
     parts, readings = out / "parts", out / "readings"
     for make in tasks(root, out, smoke=smoke):
         task = make()
         for place, members in enumerate(task.members):
-            # A large ensemble's errors hardly move with its noise.
+            # A large ensemble's errors hardly depend on its noise.
             draws = 1 if smoke or place else task.draws
             job = partial(ensembles, make, place, readings, draws)
             (large if place else made)[parts / f"{task.name}-{members}.json"] = job
@@ -142,7 +142,7 @@ def jobs(root: Path | None, out: Path, smoke: bool) -> Jobs:
 
 
 def page(rows: Sequence[dict]) -> str:
-    """Means over the recordings of each group."""
+    """Returns means over the recordings of each group."""
     lines = [
         "# Smoothers behind trained sensors",
         "",

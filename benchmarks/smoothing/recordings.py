@@ -23,22 +23,22 @@ from torch_denkf.filters import Filter
 from torch_denkf.pretrained import from_pretrained
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
-Group = dict[str, TensorDict]  # recordings of one length side by side, [N, T], by their names with blanks between
+Group = dict[str, TensorDict]  # batches of recordings of one length, [N, T], by their names joined with spaces
 
 
 @dataclass(frozen=True)
 class Task:
-    """Recordings, and the filter behind the sensor that reads them.
+    """Recordings, and the filter for their sensor.
 
     Attributes:
         name: for files and tables.
-        quantities: names of what is scored, with their units.
+        quantities: names of the scored quantities, with their units.
         dims: their dimensions of the state.
-        members: sizes of the ensemble; the first is the one that the filter was trained with.
-        draws: of the noise, of an ensemble of that size.
-        model: the trained filter, for a number of members.
-        behind: the same without its sensor.
-        read: the groups of recordings, the first for choices alone, as that filter's sensor reads them.
+        members: sizes of the ensemble; the first is the size in training.
+        draws: of the noise, for that size.
+        model: returns the trained filter for a number of members.
+        behind: returns the filter without its sensor.
+        read: returns the sensor's readings by group of recordings; the first group is for validation.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Task:
     read: Callable[[Filter], dict[str, Group]]
 
     def groups(self, members: int, folder: Path) -> dict[str, Group]:
-        """The recordings by group; read the first time, then kept in a folder."""
+        """Returns the readings by group, cached in a folder."""
         file = folder / f"{self.name}-{members}.pt"
         if not file.exists():
             folder.mkdir(parents=True, exist_ok=True)
@@ -66,9 +66,9 @@ class Task:
 
 
 def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
-    """Drives of KITTI's layout below ``root``, and drives rendered along its eleven official trajectories.
+    """Returns drives in KITTI's layout below ``root``, and drives rendered along its eleven official trajectories.
 
-    Eight drives rendered along invented trajectories are for choices. No filter and no sensor has seen any of them.
+    Eight drives rendered along synthetic trajectories are for validation. No filter or sensor was trained on them.
     """
     size = car_filter().settings.size
     frames = 30 if smoke else 600
@@ -79,7 +79,7 @@ def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
         trained = from_pretrained("car-odometry")
         assert isinstance(trained, CarFilter)
         car = car_filter(replace(trained.settings, ensemble_size=members))
-        # What each member believes of its calibration are quantiles, as many as members.
+        # The members' calibrations are quantiles, one per member.
         car.load_state_dict({k: v for k, v in trained.state_dict().items() if "quantiles" not in k}, strict=False)
         return car.eval()
 
@@ -98,7 +98,7 @@ def kitti(root: Path, out: Path, *, smoke: bool = False) -> Task:
 
 
 def drive(car: CarFilter, root: Path, name: str, cache: Path) -> TensorDict:
-    """Returns the readings of a drive; the first state is the true pose with the velocities that are read first."""
+    """Returns the readings of a drive; the first state is the true pose with the first read velocities."""
     data = Drive(root, name, car.settings.size, cache).read()
     reading = all_frames(read_spans(car.sensor, [data], car.settings.longest))
     start = reading["state"].clone()
@@ -107,7 +107,7 @@ def drive(car: CarFilter, root: Path, name: str, cache: Path) -> TensorDict:
 
 
 def ur5(out: Path, *, smoke: bool = False) -> Task:
-    """Whole demonstrations of the table's UR5: those of the test side, and a ninth of the others for choices."""
+    """Returns demonstrations of the UR5 at its table: the test split, and a ninth of the others for validation."""
 
     def model(members: int) -> UR5TableFilter:
         trained = from_pretrained("ur5-table")
@@ -134,7 +134,7 @@ def ur5(out: Path, *, smoke: bool = False) -> Task:
 
 
 def side_by_side(recordings: Iterable[tuple[str, TensorDict]]) -> Group:
-    """Recordings of one length in one batch each."""
+    """Returns recordings in batches of one length."""
     lengths: dict[int, list[tuple[str, TensorDict]]] = {}
     for name, recording in recordings:
         lengths.setdefault(len(recording), []).append((name, recording))
@@ -142,6 +142,6 @@ def side_by_side(recordings: Iterable[tuple[str, TensorDict]]) -> Group:
 
 
 def tasks(root: Path | None, out: Path, *, smoke: bool = False) -> list[Callable[[], Task]]:
-    """Returns what makes each task; KITTI's where there are data."""
+    """Returns functions that make the tasks; KITTI's only with data."""
     made: list[Callable[[], Task]] = [partial(ur5, out / "ur5", smoke=smoke)]
     return [partial(kitti, root, out / "kitti", smoke=smoke), *made] if root else made

@@ -1,4 +1,4 @@
-"""The study: its options, its jobs side by side, its table."""
+"""The study: its options, its jobs, its table."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ COLUMNS = ("system", "method", "lag", "seed", *ERRORS)
 
 @dataclass(frozen=True)
 class Study:
-    """Smoothers on Lorenz-63 and Lorenz-96, and DAPPER on the same truth and readings where it is installed.
+    """Compares smoothers on Lorenz-63 and Lorenz-96 with DAPPER, if installed, on the same truth and readings.
 
-    With --real: smoothers behind the package's trained sensors, on the UR5 and, with --root, on KITTI.
+    With --real: smoothers with the package's trained sensors, on the UR5 and, with --root, on KITTI.
     """
 
     out: Path = Path("runs/smoothing")
     seeds: int = 4
-    cycles: int = 2000  # of which the first 64 (Lorenz-63) or 133 (Lorenz-96) do not count
+    cycles: int = 2000  # of which the first 64 (Lorenz-63) or 133 (Lorenz-96) are not scored
     processes: int = 1
-    real: bool = False  # recordings in the place of chaotic systems
+    real: bool = False  # recordings instead of chaotic systems
     root: Path | None = None  # of --real: folder with KITTI's sequences and poses
     smoke: bool = False  # a few cycles: does it run?
 
 
 def page(rows: Sequence[dict], study: Study) -> str:
-    """Means over the seeds."""
+    """Returns means over the seeds."""
     lines = [
         "# Smoothers on chaotic systems",
         "",
@@ -63,7 +63,7 @@ def page(rows: Sequence[dict], study: Study) -> str:
 
 
 def main() -> None:
-    """Runs the study; one that was broken off goes on."""
+    """Runs the study; an interrupted one resumes."""
     study = parse(Study)
     if study.smoke:
         study = replace(study, out=Path(tempfile.mkdtemp(prefix="smoothing-")), cycles=26, seeds=2)
@@ -85,7 +85,7 @@ def main() -> None:
 
 
 def joined(rows: Sequence[dict]) -> list[dict]:
-    """Ours and DAPPER's of one case and seed, in one row."""
+    """Joins our row and DAPPER's row of each case and seed."""
     out: dict[tuple, dict] = {}
     for row in rows:
         key = (row["system"], row["method"], row.get("lag"), row["seed"])

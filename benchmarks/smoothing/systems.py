@@ -1,4 +1,4 @@
-"""The two systems: their motion as a transition, their truth and readings, one generator a seed."""
+"""The two systems: their motion as a transition, their truth and readings, with one generator per seed."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from torch_denkf.modules import SubModel
 
 @dataclass(frozen=True)
 class System:
-    """A chaotic system, observed completely, every so many small steps.
+    """A chaotic system, whose whole state is observed once in each cycle of small steps.
 
     Attributes:
         step: one small step of states ``[*, N]``.
-        mean: of the first state, ``N`` numbers.
+        mean: of the first state, ``N`` components.
         variance: of each of its components.
         noise: variance of the readings.
         steps: small steps in a cycle.
-        burn_in: cycles before the first that count.
+        burn_in: first cycles, which are not scored.
     """
 
     step: Callable[[Tensor], Tensor]
@@ -34,12 +34,12 @@ class System:
     burn_in: int
 
     def counts_from(self, cycles: int) -> int:
-        """The first cycle of so many that counts: at the latest that in the middle."""
+        """Returns the first scored cycle, at the latest the middle one."""
         return min(self.burn_in, cycles // 2)
 
 
 def lorenz63_step(state: Tensor, dt: float = 0.01) -> Tensor:
-    """One Runge-Kutta step of the system of Lorenz 1963, states ``[*, 3]``."""
+    """Returns one Runge-Kutta step of the system of Lorenz 1963, states ``[*, 3]``."""
 
     def tendency(state: Tensor) -> Tensor:
         x, y, z = state.unbind(-1)
@@ -62,21 +62,21 @@ SYSTEMS = {
 
 
 class Cycle(SubModel):
-    """The motion of members over one cycle."""
+    """Transition of members over one cycle."""
 
     def __init__(self, system: System):
         super().__init__(nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])
         self.system = system
 
     def compute(self, ensemble):
-        """The forecast."""
+        """Returns the forecast."""
         for _ in range(self.system.steps):
             ensemble = self.system.step(ensemble)
         return ensemble
 
 
 def simulate(system: System, seeds: Sequence[int], cycles: int) -> tuple[Tensor, Tensor]:
-    """The truth at every small step, ``[seeds, cycles * steps + 1, N]``, and the readings, ``[seeds, cycles, N]``."""
+    """Returns true states of all small steps ``[seeds, cycles * steps + 1, N]``, readings ``[seeds, cycles, N]``."""
     mean = torch.tensor(system.mean, dtype=torch.float64)
     generators = [torch.Generator().manual_seed(seed) for seed in seeds]
     normal = torch.stack([torch.randn(cycles + 1, len(mean), generator=g, dtype=torch.float64) for g in generators])
@@ -88,6 +88,6 @@ def simulate(system: System, seeds: Sequence[int], cycles: int) -> tuple[Tensor,
 
 
 def frames_of(readings: Tensor) -> TensorDict:
-    """Sequences of all seeds ``[seeds, cycles + 1]``; the first element is the start, which has no reading."""
+    """Returns sequences of all seeds ``[seeds, cycles + 1]``; the first element is the start, which has no reading."""
     start = torch.zeros_like(readings[:, :1])
     return TensorDict({"reading": torch.cat([start, readings], 1)}, [len(readings), readings.shape[1] + 1])

@@ -1,1 +1,1 @@
-"""Speed side by side: this library against its peers, a textbook step, and the machine's floor; ``make bench``."""
+"""Compares the speed of this library with its peers and a textbook step; ``make bench``."""

@@ -1,4 +1,4 @@
-"""Runs every pair in a process of its own, one after the other, and writes the report.
+"""Runs every pair in a separate process, one after the other, and writes the report.
 
 python -m benchmarks.speed                      # all pairs: results/speed.{md,json}
 python -m benchmarks.speed --only against_textbook packaged_step
@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-#: Of this package: one file a peer, with rows(seconds) -> list[Row].
+#: Modules of this package: one for each peer, with rows(seconds) -> list[Row].
 PAIRS = (
     "tensordict_cost",
     "against_textbook",
@@ -26,17 +26,16 @@ PAIRS = (
     "against_dynamax",
     "against_filterpy",
     "against_dapper",
-    "against_floor",
     "packaged_step",
     "one_row",
     "log_of_attitude",
     "training_step",
-    "transform_cost",  # which is a command of its own, too
+    "transform_cost",  # also a separate command
 )
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-#: How many processes, one after the other, measure a pair: a ratio that jumps from run to run is their median.
+#: Number of processes, one after the other, that measure a pair whose ratio varies; the result is their median.
 RUNS = {"against_cuthbert": 3}
-LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes beside other jobs
+LIMIT_S = 2400  # for a pair: four compiled filters take twenty minutes next to other jobs
 
 
 def in_this_process(name: str, seconds: float, out: Path) -> None:
@@ -45,7 +44,7 @@ def in_this_process(name: str, seconds: float, out: Path) -> None:
 
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    if hasattr(os, "sched_setaffinity"):  # on two cores jax hands small steps from thread to thread: slower
+    if hasattr(os, "sched_setaffinity"):  # on two cores jax moves small steps between threads, which is slower
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     if name == "machine":
         from benchmarks.speed.machine import measure
@@ -57,7 +56,7 @@ def in_this_process(name: str, seconds: float, out: Path) -> None:
 
 
 def in_own_process(name: str, seconds: float) -> list[dict] | dict:
-    """Runs one pair in a fresh process; where it fails, a row without a ratio says why."""
+    """Runs one pair in a new process; on failure, returns a row without a ratio, with the reason in its note."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "rows.json"
         command = [sys.executable, "-m", "benchmarks.speed", "--pair", name, str(out), "--seconds", str(seconds)]
@@ -85,7 +84,7 @@ def in_own_process(name: str, seconds: float) -> list[dict] | dict:
 
 
 def measured(name: str, seconds: float) -> list[dict]:
-    """The rows of a pair; of several runs each row is the one with the middle ratio, and ``range`` the outer two."""
+    """Returns the rows of a pair; for several runs the median ratio, and the lowest and the highest as ``range``."""
     runs = [{row["name"]: row for row in in_own_process(name, seconds)} for _ in range(RUNS.get(name, 1))]
     rows = []
     for row in runs[0]:
@@ -99,7 +98,7 @@ def measured(name: str, seconds: float) -> list[dict]:
 
 
 def smoke() -> None:
-    """Pairs that need no other package, tiny."""
+    """Runs tiny versions of the pairs that need no other package."""
     from benchmarks.speed import against_textbook, training_step, transform_cost
 
     transform_cost.TransformCost(smoke=True)()
@@ -144,7 +143,7 @@ def main() -> None:
         new = [{**row, "pair": name} for row in measured(name, args.seconds)]
         for row in new:
             print(f"  {row['name']}: {number(row['ratio']) or row.get('note')} (target {number(row.get('target'))})")
-        # Rows of pairs that were not run again stay, and a run that is stopped leaves what it has measured.
+        # Rows of other pairs stay, and an interrupted run keeps the rows that it has measured.
         old = json.loads(known.read_text()) if known.exists() else []
         if args.plain:
             plain = {row["name"]: row["ratio"] for row in new if row["name"].startswith("compiled")}

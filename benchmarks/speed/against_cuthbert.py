@@ -14,7 +14,7 @@ LIMITS = {(1, False): (0.7, None), (64, False): (0.5, None), (1, True): (0.8, No
 
 
 def cuthbert_sequence(batch: int, backward: bool):
-    """Their filter over a sequence, jitted: a function without arguments that waits for the result."""
+    """Returns their jitted filter over a sequence, as a function without arguments that waits for the result."""
     from cuthbert import filter as run
     from cuthbert.ensemble_kalman import ensemble_kalman_filter
 
@@ -56,7 +56,7 @@ def cuthbert_sequence(batch: int, backward: bool):
 
 
 def same_networks() -> None:
-    """Both compute the same forecast without noise, or the comparison is void."""
+    """Checks that both compute the same forecast without noise."""
     filter = make_filter()
     x = torch.randn(STATE)
     theirs = mlp(jax.tree.map(jnp.asarray, weights(filter))["transition"], jnp.asarray(x.numpy()))

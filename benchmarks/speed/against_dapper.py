@@ -20,7 +20,7 @@ SCHEMES = {"perturbed": ("PertObs", 40, 1.06), "sakov": ("DEnKF", 40, 1.01)}
 
 
 def make_cycle(scheme: str, inflation: float) -> Callable:
-    """Forecast, analysis, inflation; error of the mean and spread."""
+    """Returns a cycle of forecast, analysis and inflation, with error of the mean and spread."""
 
     def cycle(ensemble, state, observation, noise, draws):
         ensemble = lorenz96_step(ensemble)
@@ -34,7 +34,7 @@ def make_cycle(scheme: str, inflation: float) -> Callable:
 
 
 def our_run(cycle: Callable, size: int, truth: torch.Tensor, observations: torch.Tensor):
-    """Cycles with their error and spread, both ``[cycles]``; double precision, as theirs."""
+    """Runs all cycles, and returns error and spread, both ``[cycles]``; in double precision, as theirs."""
     ensemble = truth[0] + 0.03 * torch.randn(size, truth.shape[-1], dtype=truth.dtype)
     noise = torch.ones_like(truth[0])
     draws = torch.randn(len(observations), *ensemble.shape, dtype=truth.dtype)

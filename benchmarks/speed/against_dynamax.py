@@ -1,7 +1,7 @@
 """A sequence of EKF and UKF against dynamax's (JAX), jitted, at B = 64 vmapped: one model, one set of weights.
 
-Both sides take the same readings from the same belief and give the same means and covariances, forecast and updated;
-:func:`same_beliefs` checks that before anything is timed. Theirs forecasts once more, after the last reading.
+Both sides start from the same belief, read the same readings, and return the same means and covariances, forecast and
+updated; :func:`same_beliefs` checks that before the timing. Theirs has one more forecast, after the last reading.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WARM_S = 0.03
 
 
 def dynamax_sequence(kind: str, batch: int) -> Callable[[], object]:
-    """Their filter over a sequence, jitted: a function without arguments that waits for the posterior."""
+    """Returns their jitted filter over a sequence, as a function without arguments that waits for the posterior."""
     from dynamax.nonlinear_gaussian_ssm import (
         ParamsNLGSSM,
         UKFHyperParams,
@@ -67,13 +67,13 @@ def dynamax_sequence(kind: str, batch: int) -> Callable[[], object]:
 
 
 def same_beliefs(filter: Filter, kind: str, batch: int) -> None:
-    """Both compute the same means, covariances and likelihood on the readings that are timed, or a ratio is void.
+    """Checks that both compute the same means, covariances and likelihood on the timed readings.
 
     In single precision they differ by 1e-5 at most: theirs updates P - K S K', ours in Joseph's form, and our sigma
-    points stand on a ridge.
+    points use a regularised covariance.
 
     Raises:
-        AssertionError: if they do not.
+        AssertionError: if they differ by more.
     """
     with torch.no_grad():
         ours = filter.sequence(make_frames(batch, FRAMES, samples=False))

@@ -12,7 +12,7 @@ NOTE = "same networks and weights; theirs calls them for each member, and adds a
 
 
 def mlp(layers: list, x: np.ndarray, random: np.random.Generator | None = None) -> np.ndarray:
-    """ReLU network on one row; with a generator, dropout drawn in each layer."""
+    """Runs a ReLU network on one row; with a generator, with dropout in each layer."""
     for weight, bias in layers[:-1]:
         x = np.maximum(weight @ x + bias, 0)
         if random is not None:
@@ -22,7 +22,7 @@ def mlp(layers: list, x: np.ndarray, random: np.random.Generator | None = None) 
 
 
 def filterpy_loop():
-    """Their predict and update, from the members of the last call."""
+    """Returns a call of their predict and update, from the members of the last call."""
     from filterpy.kalman import EnsembleKalmanFilter
 
     filter = make_filter()

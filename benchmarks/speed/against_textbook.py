@@ -16,7 +16,7 @@ LIMITS = {(1, False): (0.5, 0.35), (64, False): (0.55, 0.4), (1, True): (0.75, 0
 
 
 def textbook(batch: int, backward: bool) -> Callable[[], object]:
-    """The plain step over a sequence."""
+    """Returns the plain step over a sequence."""
     filter = make_filter()
     plain, ensemble = Textbook.of(filter), start(filter, batch)
     samples = make_frames(batch, STEPS).get(("sensor", "ensemble"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-# One thread, as everybody else; read when jax is imported.
+# One thread, as for all candidates; read when jax is imported.
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -15,7 +15,7 @@ from benchmarks.speed.workload import RATE
 
 
 def mlp(layers: list, x: jax.Array, key: jax.Array | None = None) -> jax.Array:
-    """ReLU network on one row ``[in]``; with a key, dropout after each hidden layer, drawn in the layer."""
+    """Runs a ReLU network on one row ``[in]``; with a key, with dropout after each hidden layer."""
     keys = None if key is None else jax.random.split(key, len(layers) - 1)
     for index, (weight, bias) in enumerate(layers[:-1]):
         x = jax.nn.relu(weight @ x + bias)

@@ -1,6 +1,6 @@
-"""A log of 13,500 rows at 100 Hz, attitude: seconds of filter and smoother from a cold start, in a process of its own.
+"""Times filter and smoother on an attitude log of 13,500 rows at 100 Hz, from a cold start.
 
-Cold is a fresh process with an empty cache of torch's compiler, eager and compiled in steps (``chunk=1``).
+Cold is a new process with an empty cache of torch's compiler, eager and compiled in steps (``chunk=1``).
 
 python -m benchmarks.speed.log_of_attitude eager     # one way in this process, in seconds
 """
@@ -25,7 +25,7 @@ WAYS = ("eager", "compiled")
 
 
 def filter_and_smooth(way: str) -> dict[str, float]:
-    """Seconds of the filter and the smoother of a log, the first compilation included."""
+    """Returns the seconds of filter and smoother on a log, including the first compilation."""
     begun = time.perf_counter(), time.process_time()
     filter, row = attitude()
     log = torch.stack([row] * ROWS, 1)
@@ -37,7 +37,7 @@ def filter_and_smooth(way: str) -> dict[str, float]:
 
 
 def rows(seconds: float) -> list[Row]:
-    """Rows of the table."""
+    """Returns rows of the table."""
     found = []
     for way in WAYS:
         with tempfile.TemporaryDirectory() as cache:

@@ -1,4 +1,4 @@
-"""Measures what the machine can do in the same run: matrix peak and memory bandwidth of one thread."""
+"""Measures matrix peak and memory bandwidth of one thread in the same run."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from benchmarks.common.arguments import processor
 
 
 def matrix_product(size: int = 768):
-    """A product of two square float32 matrices, and the number of its floating-point operations."""
+    """Returns a product of two square float32 matrices, and the number of its floating-point operations."""
     left, right, out = torch.randn(size, size), torch.randn(size, size), torch.empty(size, size)
     return lambda: torch.mm(left, right, out=out), 2 * size**3
 
 
 def best(call, repeats: int = 40) -> float:
-    """The least processor time of a call, in s."""
+    """Returns the least processor time of a call, in s."""
     times = []
     for _ in range(repeats):
         begun = time.process_time()
@@ -27,7 +27,7 @@ def best(call, repeats: int = 40) -> float:
 
 
 def measure() -> dict:
-    """Peak in GFLOP/s (float32, one thread), bandwidth in GB/s (read and write of a copy), and what was run on.
+    """Returns peak in GFLOP/s (float32, one thread), bandwidth in GB/s (read and write of a copy), and versions.
 
     Both are the best of 40, in processor time.
     """

@@ -1,7 +1,7 @@
-"""A log of one robot: milliseconds a row, eagerly and compiled, and seconds of the first compiled call.
+"""A log of one robot: milliseconds per row, eagerly and compiled, and seconds of the first compiled call.
 
-The attitude filter's other side is numpy with the same equations. The first call is timed in a process of its own, with
-an empty cache of torch's compiler, and once more in another process, which finds it there.
+The attitude filter is compared with the same equations in numpy. The first call is timed in a new process with an empty
+cache of torch's compiler, and again in a second process with the filled cache.
 
 python -m benchmarks.speed.one_row attitude     # one first call in this process: wall and processor time, in seconds
 """
@@ -32,7 +32,7 @@ from torch_denkf.motions import AttitudeMotion, Gravity, Magnetic
 DT, GYRO_NOISE, GYRO_WALK = 0.01, 1e-3, 1e-5  # s, rad/s/sqrt(Hz), rad/s^2/sqrt(Hz)
 FORCE_STD, FIELD_STD, FIELD = 0.5, 1.0, (0.0, 20.0, -40.0)  # m/s^2, uT, uT
 START = [0.1] * 3 + [0.01] * 3  # variances: rad^2, (rad/s)^2
-#: Wanted: ms of an eager row, and s of a first call, of one in a second process.
+#: Targets: ms of an eager row; s of a first call with an empty cache, and in a second process.
 WANTED_MS = {"Kalman, 2 states": 0.2, "EKF, Table I": 1.0, "DEnKF, Table I, 32 members": 0.75, "attitude EKF": 1.2}
 WANTED_S = (15.0, 4.0)
 SHORT = {"kalman": "Kalman, 2 states", "ekf": "EKF, Table I", "denkf": "DEnKF, Table I, 32 members"}
@@ -76,7 +76,7 @@ FILTERS: dict[str, Callable[[], tuple[Filter, TensorDict]]] = {
 
 
 def numpy_attitude() -> Callable[[], np.ndarray]:
-    """A row of the attitude filter a call, in double precision: numpy is no faster in single."""
+    """Returns a call that runs the attitude filter on one row, in double precision: numpy is no faster in single."""
     row = {key: value.numpy().astype(float) for key, value in attitude()[1].items()}
     constants = [(row["force"], np.array([0.0, 0.0, 9.81]), FORCE_STD), (row["field"], np.array(FIELD), FIELD_STD)]
     q = np.diag([GYRO_NOISE**2 * DT] * 3 + [GYRO_WALK**2 * DT] * 3)
@@ -107,7 +107,7 @@ def numpy_attitude() -> Callable[[], np.ndarray]:
 
 
 def eager(name: str) -> Callable[[], TensorDict]:
-    """A row a call."""
+    """Returns a call that runs one row eagerly."""
     filter, row = FILTERS[name]()
     filter.initialise(row)
 
@@ -119,7 +119,7 @@ def eager(name: str) -> Callable[[], TensorDict]:
 
 
 def first_call(name: str, chunk: int = 1) -> dict[str, float]:
-    """Seconds of a filter's first compiled sequence in this process, and then milliseconds a row."""
+    """Returns the seconds of a filter's first compiled sequence in this process, and then milliseconds per row."""
     filter, row = FILTERS[name]()
     filter.compile(chunk=chunk)
     log = torch.stack([row] * 200, 1)
@@ -135,7 +135,7 @@ def first_call(name: str, chunk: int = 1) -> dict[str, float]:
 
 
 def rows(seconds: float) -> list[Row]:
-    """Rows of the table."""
+    """Returns rows of the table."""
     calls: dict[str, Callable[[], object]] = {name: eager(name) for name in FILTERS}
     timings = interleave({**calls, "numpy": numpy_attitude()}, seconds=seconds)
     found = []
@@ -155,7 +155,7 @@ def rows(seconds: float) -> list[Row]:
             ]
         for which, run, wanted in zip(("empty cache", "second process"), both, WANTED_S, strict=True):
             note = (
-                f"seconds, no ratio; processor time {run['processor']:.1f} s; then {run['row']:.3f} ms a row, chunk=1"
+                f"seconds, no ratio; processor time {run['processor']:.1f} s; then {run['row']:.3f} ms per row, chunk=1"
             )
             found.append(Row(f"first compiled call, {SHORT[name]}, {which}, s", run["wall"], target=wanted, note=note))
     return found

@@ -1,4 +1,4 @@
-"""Candidates made of this library: a filter on tensordicts, the same functions without tensordicts, and a sequence."""
+"""Candidates of this library: a step on a tensordict, the same functions without tensordicts, and a sequence."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ CHUNK = 20
 
 
 def sequences(batch: int, *, scheme: str = "sensor", backward: bool = False) -> dict[str, Callable[[], Tensor]]:
-    """The sequence eagerly and, unless SPEED_COMPILE=0, compiled in chunks; names for the table."""
+    """Returns the sequence by kind for the table: eager and, unless SPEED_COMPILE=0, compiled in chunks."""
     fields = {"samples": scheme == "sensor", "backward": backward}
     return {kind: sequence(filter, batch, **fields) for kind, filter in filters(make_filter, scheme).items()}
 
 
 def steps(batch: int) -> dict[str, Callable[[], Tensor]]:
-    """A step on a tensordict, eagerly and compiled likewise."""
+    """Returns a step on a tensordict by kind, eager and compiled."""
     return {kind: tensordict_loop(filter, batch) for kind, filter in filters(make_filter).items()}
 
 
 def filters(make: Callable[..., Filter], *options: str) -> dict[str, Filter]:
-    """An eager filter and, unless SPEED_COMPILE=0, a compiled one: with SPEED_PLAIN=1 by inductor as it is."""
+    """Returns an eager filter and, unless SPEED_COMPILE=0, a compiled one; SPEED_PLAIN=1 uses plain inductor."""
     found = {"eager": make(*options)}
     if os.environ.get("SPEED_COMPILE") != "0":
         backend = {"backend": "inductor"} if os.environ.get("SPEED_PLAIN") == "1" else {}
@@ -38,11 +38,11 @@ def filters(make: Callable[..., Filter], *options: str) -> dict[str, Filter]:
 
 
 def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
-    """The filter's step as plain functions of tensors: the same networks, noise in bulk, analysis and moments.
+    """Returns the filter's step as plain functions of tensors: the same networks, noise, analysis and moments.
 
     Returns:
-        A function of members ``[*B, E, S]`` and the sensor's samples ``[*B, E, O]`` or reading ``[*B, O]``, to all
-        that the filter writes: noise, forecast, predicted observation, members, mean, variance, diagnostics.
+        A function of members ``[*B, E, S]`` and the sensor's samples ``[*B, E, O]`` or reading ``[*B, O]`` that returns
+        all outputs of the filter: noise, forecast, predicted observation, members, mean, variance, diagnostics.
     """
     network, observe, noise = (filter[name].module for name in ("transition", "observation", "noise"))
     variance, floor, loc, scale = (getattr(filter["noise"], name) for name in ("variance", "floor", "loc", "scale"))
@@ -62,7 +62,7 @@ def functional_step(filter: DEnKF) -> Callable[[Tensor, Tensor], tuple[Tensor, .
 
 
 def functional_loop(filter: DEnKF, batch: int) -> Callable[[], Tensor]:
-    """A step a call on plain tensors, each from the members of the last."""
+    """Returns a call that runs one step on plain tensors, from the members of the last call."""
     step, samples = functional_step(filter), make_frames(batch, 1).get(("sensor", "ensemble"))[:, 0]
     state = [start(filter, batch)]
 
@@ -75,7 +75,7 @@ def functional_loop(filter: DEnKF, batch: int) -> Callable[[], Tensor]:
 
 
 def tensordict_loop(filter: Filter, batch: int) -> Callable[[], Tensor]:
-    """A step a call on one tensordict, each from the belief of the last."""
+    """Returns a call that runs one step on a tensordict, from the belief of the last call."""
     row = make_frames(batch, 1)[:, 0].set(("belief", "ensemble"), start(filter, batch))
 
     def call() -> Tensor:
@@ -87,7 +87,7 @@ def tensordict_loop(filter: Filter, batch: int) -> Callable[[], Tensor]:
 
 
 def sequence(filter: Filter, batch: int, *, samples: bool = True, backward: bool = False) -> Callable[[], Tensor]:
-    """A whole sequence of STEPS steps a call, one frame more because the first is where it starts."""
+    """Returns a call that runs a sequence of STEPS steps; the first of its STEPS + 1 frames has the initial belief."""
     frames = make_frames(batch, STEPS + 1, samples=samples)
     parameters = list(filter.parameters())
 

@@ -1,4 +1,4 @@
-"""A step out of its package (AOTInductor) against the same step, eager, at B = 1; and its latency."""
+"""Compares a packaged step (AOTInductor) with the same eager step at B = 1, and measures its latency."""
 
 from __future__ import annotations
 

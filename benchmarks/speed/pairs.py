@@ -1,8 +1,8 @@
-"""Timing of candidates side by side: short interleaved rounds in one process, and the median of the rounds' ratios.
+"""Times candidates in short interleaved rounds in one process, and returns the median of the rounds' ratios.
 
-A round times every candidate once, so that what slows the machine for a while slows all of them; which one goes first
-changes from round to round. What is timed is the processor time of the process, all its threads together: other jobs
-on the same cores do not count, and a peer that spreads over two threads pays for both.
+A round times every candidate once, so that a slowdown of the machine affects all of them; the order changes from round
+to round. Times are processor time over all threads of the process: other jobs on the same cores do not count, and a
+peer with two threads pays for both.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ class Row:
     """One line of the table.
 
     Attributes:
-        name: what is compared, with its size.
+        name: the compared work, with its size.
         ratio: ours over theirs; below 1 ours is faster.
-        target: the ratio must not exceed it; ``None`` where there is none to meet.
-        least: nor be below this, where it is no ratio of times.
-        aim: the ratio hoped for.
-        ours_us: microseconds of processor time that ours takes, a step unless the name says otherwise.
-        theirs_us: the same of the other.
-        note: what differs between the two, in a line.
+        target: upper limit of the ratio; ``None`` for none.
+        least: lower limit, for values that are no ratios of times.
+        aim: a ratio to aim for.
+        ours_us: microseconds of our processor time, per step unless the name says otherwise.
+        theirs_us: the same of the other side.
+        note: differences between the two sides, in a line.
     """
 
     name: str
@@ -43,36 +43,36 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Tells whether the target is met; ``None`` without a target or a measurement."""
+        """Returns whether the target is met; ``None`` without a target or a measurement."""
         return None if self.target is None or self.ratio is None else self.least <= self.ratio <= self.target
 
     @property
     def met_text(self) -> str:
-        """The same in a table."""
+        """Returns :attr:`met` as text for a table."""
         return MET[self.met]
 
     def as_dict(self) -> dict:
-        """Returns what is written to JSON."""
+        """Returns the entries for JSON."""
         return {name: value for name, value in asdict(self).items() if name != "least"} | {"met": self.met}
 
 
 @dataclass(frozen=True)
 class Timings:
-    """Seconds of processor time a call, for each candidate one number a round."""
+    """Seconds of processor time per call, for each candidate and round."""
 
     rounds: dict[str, list[float]]
 
     def micro(self, name: str, per: int = 1) -> float:
-        """Median microseconds of a candidate; ``per`` is the number of steps in a call."""
+        """Returns the median microseconds of a candidate; ``per`` is the number of steps in a call."""
         return 1e6 * median(self.rounds[name]) / per
 
     def ratio(self, ours: str, theirs: str) -> float:
-        """Median over the rounds of ours over theirs."""
+        """Returns the median over the rounds of ours over theirs."""
         pairs = zip(self.rounds[ours], self.rounds[theirs], strict=True)
         return median(ours_time / theirs_time for ours_time, theirs_time in pairs)
 
     def row(self, name: str, ours: str, theirs: str, *, per: int = 1, **fields) -> Row:
-        """The table's line for two of the candidates."""
+        """Returns the table's line for two of the candidates."""
         times = {"ours_us": self.micro(ours, per), "theirs_us": self.micro(theirs, per)}
         return Row(name, self.ratio(ours, theirs), **times, **fields)
 
@@ -84,9 +84,9 @@ def interleave(
 
     Args:
         candidates: functions without arguments, by name; each is called a few times beforehand.
-        seconds: wall-clock time to spend; at least ``rounds`` rounds are made all the same.
-        shortest: a measurement repeats a call until it takes this long, in s.
-        rounds: the fewest rounds.
+        seconds: wall-clock time to spend, if more than ``rounds`` rounds fit into it.
+        shortest: least duration of a measurement in s, which repeats its call accordingly.
+        rounds: least number of rounds.
     """
     numbers = {}
     for name, call in candidates.items():
@@ -109,7 +109,7 @@ def interleave(
                     call()
                 times[name].append((time.process_time() - begun) / numbers[name])
             done += 1
-            if done % 20 == 0:  # autograd leaves cycles behind
+            if done % 20 == 0:  # autograd makes reference cycles
                 gc.collect()
     finally:
         gc.enable()
@@ -117,22 +117,22 @@ def interleave(
 
 
 def against(ours: Mapping[str, Call], name: str, theirs: Call, title: str, *, how: dict, **fields) -> list[Row]:
-    """A line for each of ours beside another package's.
+    """Returns a row for each of our calls against another package's.
 
     Args:
-        ours: by kind.
+        ours: our calls by kind.
         name: of the other package.
         theirs: its call.
-        title: of the lines, behind the kind.
-        how: of :func:`interleave`.
-        **fields: of the lines.
+        title: of the rows, after the kind.
+        how: options of :func:`interleave`.
+        **fields: of the rows.
     """
     timings = interleave({**ours, name: theirs}, **how)
     return [timings.row(f"{kind} {title}", kind, name, **fields) for kind in ours]
 
 
 def in_turn(calls: Mapping[str, Callable[[], object]], rounds: int, repeats: int = 1) -> Timings:
-    """Times calls that take long: so many rounds of all of them, after one that warms up; each so often in a round."""
+    """Times slow calls: ``rounds`` rounds of all after a warm-up, with ``repeats`` calls of each in a round."""
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(rounds + 1):
         for name, call in calls.items():
@@ -145,7 +145,7 @@ def in_turn(calls: Mapping[str, Callable[[], object]], rounds: int, repeats: int
 
 
 def settle(limit: float = 30.0) -> None:
-    """Waits until this process stands still, at most ``limit`` seconds: inductor's threads go on after compiling."""
+    """Waits until this process is idle, at most ``limit`` seconds: inductor's threads run on after compiling."""
     end = time.perf_counter() + limit
     while time.perf_counter() < end:
         begun = time.process_time()

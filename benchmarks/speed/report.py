@@ -11,14 +11,14 @@ from torch_denkf.deployment.files import write_text
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A ratio or a time, short; empty where there is none."""
+    """Formats a ratio or a time with few digits; empty if there is none."""
     if value is None:
         return ""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.{digits}f}" if abs(value) < 10 else f"{value:.1f}"
 
 
 def markdown(rows: list[dict], machine: dict, command: str, seconds: float) -> str:
-    """The page of results."""
+    """Returns the page of results."""
     lines = [
         "# Speed, side by side",
         "",

@@ -1,6 +1,6 @@
-"""The filter on a tensordict against its own functional step, where pandas is not installed.
+"""Compares the filter on a tensordict with its own functional step, without pandas.
 
-tensordict looks for pandas on some writes, which costs most where there is none: here the search never finds it.
+tensordict looks for pandas on some writes, which is slowest if it is not installed: here the search never finds it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ NOTE = "one step each, the functions eager; both draw their noise and compute al
 
 
 def without_pandas() -> None:
-    """Makes every search for pandas fail, after looking for a name that is not there either."""
+    """Makes every search for pandas fail as slowly as one for a missing package."""
     search = importlib.util.find_spec
 
     def find_spec(name: str, package: str | None = None):

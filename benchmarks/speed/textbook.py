@@ -1,4 +1,4 @@
-"""The yardstick: a plain, hand-written DEnKF step in torch, as a paper's code would have it."""
+"""A baseline: a plain, hand-written DEnKF step in torch, as in the code of a paper."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch_denkf.filters import DEnKF
 
 
 def network(layers: list[tuple], rate: float) -> nn.Sequential:
-    """Linear layers with ReLU and, with a rate, dropout between them."""
+    """Returns linear layers with ReLU and, with a rate, dropout between them."""
     parts: list[nn.Module] = []
     for index, (weight, bias) in enumerate(layers):
         linear = nn.Linear(weight.shape[1], weight.shape[0])
@@ -27,7 +27,7 @@ def network(layers: list[tuple], rate: float) -> nn.Sequential:
 
 
 class AlwaysDropout(nn.Module):
-    """Dropout that is on, whatever the mode."""
+    """Dropout that is active in any mode."""
 
     def __init__(self, rate: float):
         super().__init__()
@@ -39,7 +39,7 @@ class AlwaysDropout(nn.Module):
 
 
 class Textbook(nn.Module):
-    """Forecast, predicted observation, noise, gain by Cholesky, update; ``[B, E, ...]``."""
+    """DEnKF step: forecast, predicted observation, noise, gain by Cholesky, update; ``[B, E, ...]``."""
 
     def __init__(self, layers: dict[str, list], variance: Tensor, floor: Tensor):
         super().__init__()
@@ -50,13 +50,13 @@ class Textbook(nn.Module):
 
     @classmethod
     def of(cls, filter: DEnKF) -> Textbook:
-        """With the weights of a filter of :mod:`benchmarks.speed.workload`."""
+        """Makes the step with the weights of a filter of :mod:`benchmarks.speed.workload`."""
         from benchmarks.speed.workload import noise_floor, weights
 
         return cls(weights(filter), *map(torch.as_tensor, noise_floor(filter)))
 
     def step(self, ensemble: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
-        """From the members at t-1 and the sensor's samples at t to the members and their mean at t."""
+        """Maps the members at t-1 and the sensor's samples at t to the members and their mean at t."""
         forecast = ensemble + self.transition(ensemble)
         predicted = self.observation(forecast)
         r = self.variance * (1 + self.noise(samples.mean(-2))) ** 2 + self.floor
@@ -69,7 +69,7 @@ class Textbook(nn.Module):
         return analysis, analysis.mean(-2)
 
     def sequence(self, ensemble: Tensor, samples: Tensor) -> tuple[Tensor, Tensor]:
-        """Steps over ``samples`` ``[B, T, E, O]``; ensembles ``[B, T, E, S]`` and means."""
+        """Steps over ``samples`` ``[B, T, E, O]``; returns ensembles ``[B, T, E, S]`` and means."""
         ensembles, means = [], []
         for frame in samples.unbind(1):
             ensemble, mean = self.step(ensemble, frame)

@@ -1,8 +1,8 @@
-"""A training step of the README's KITTI filter with Table I's image sensor, beside its image trunk alone.
+"""A training step of the README's KITTI filter with Table I's image sensor, compared with its image trunk alone.
 
-64 sequences of 20 frames, 150x50x6, in single precision: filter, fair CRPS, backward, clipping, AdamW. Beside it, in
-the same rounds and on the same frames, the trunk's own forward and backward, once on all 1,280 frames in one call, as
-``trunk(frames)`` does it, and once in the sensor's chunks.
+64 sequences of 20 frames, 150x50x6, in single precision: filter, fair CRPS, backward, clipping, AdamW. The trunk's own
+forward and backward run in the same rounds and on the same frames, once on all 1,280 frames in one call
+(``trunk(frames)``), and once in the sensor's chunks.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ ALONE = {"trunk alone, all frames in one call": False, "trunk alone, chunks": Tr
 
 
 def make_filter(**options) -> DEnKF:
-    """The README's filter of a vehicle."""
+    """Returns the README's filter of a vehicle."""
     torch.manual_seed(0)
     return car_filter(lambda: ImageSensor(observation_dim=2, image_shape=IMAGE, **options))
 
 
 def make_batch(batch: int = BATCH, steps: int = STEPS) -> TensorDict:
-    """Noise in the shapes of a batch; what it shows does not matter to the clock."""
+    """Returns random frames in the shapes of a batch, as times do not depend on the contents."""
     generator = torch.Generator().manual_seed(0)
     pixels = torch.rand(batch, steps, *IMAGE, generator=generator) - 0.5
     return TensorDict({"pixels": pixels, "state": torch.randn(batch, steps, 5, generator=generator)}, [batch, steps])
 
 
 def training_step(denkf: DEnKF, batch: TensorDict):
-    """One update, as a function without arguments."""
+    """Returns a function without arguments that runs one update."""
     loss, optimiser = DEnKFLoss(denkf), torch.optim.AdamW(denkf.parameters(), lr=1e-4)
 
     def step() -> None:
@@ -48,7 +48,7 @@ def training_step(denkf: DEnKF, batch: TensorDict):
 
 
 def trunk_alone(denkf: DEnKF, batch: TensorDict, *, chunked: bool):
-    """The trunk's forward and backward on all frames; chunked: by the sensor's own hand."""
+    """Returns a call of the trunk's forward and backward on all frames, optionally in the sensor's chunks."""
     sensor, frames = denkf["sensor"], batch["pixels"].flatten(0, 1)
     trunk = sensor.module["trunk"]
 
@@ -61,7 +61,7 @@ def trunk_alone(denkf: DEnKF, batch: TensorDict, *, chunked: bool):
 
 
 def rows(seconds: float, rounds: int = 7, batch: int = BATCH, steps: int = STEPS) -> list[Row]:
-    """A training step over the trunk's own forward and backward; it takes as long as it takes."""
+    """Returns rows of a training step against the trunk's forward and backward; ``seconds`` does not limit them."""
     data, filter = make_batch(batch, steps), make_filter()
     calls = {"step": training_step(filter, data)}
     calls |= {name: trunk_alone(filter, data, chunked=chunked) for name, chunked in ALONE.items()}

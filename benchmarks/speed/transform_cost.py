@@ -2,11 +2,11 @@
 
     python -m benchmarks.speed.transform_cost --out benchmarks/speed/results/transform_cost.md
 
-Steps are taken as a collector takes them, with random actions, ``env.step_and_maybe_reset``. Without the transform,
-with it, and with it and a packaged step (``DEnKFTransform(filter, packaged=load_step(path))``) in turn, processor time
-of one thread; the cost is the difference of neighbouring rounds, its median is reported. No filter here reads images:
-the KITTI filter is Table I's on noisy velocities (the convolutions are in training_step.py), the reacher's
-that of examples/append_to_env.py.
+Steps are those of a collector, with random actions: ``env.step_and_maybe_reset``. They run in turn without the
+transform, with it, and with a packaged step (``DEnKFTransform(filter, packaged=load_step(path))``), in processor time
+of one thread; the cost is the median difference of neighbouring rounds. No filter here reads images: the KITTI filter
+is Table I's on noisy velocities (the convolutions are in training_step.py), the reacher's that of
+examples/append_to_env.py.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ LAST = ("quietest", "target", "met")
 
 
 class Reading(Transform):
-    """Writes velocities with noise, what a sensor would read, as ``"reading"`` [*B, 2]."""
+    """Writes noisy velocities as ``"reading"`` [*B, 2]."""
 
     def __init__(self):
         super().__init__(in_keys=["state"], out_keys=["reading"])
@@ -61,18 +61,18 @@ class Reading(Transform):
 
 
 def kitti_filter() -> DEnKF:
-    """The README's, with Table I's stochastic head on a reading in the place of the image sensor."""
+    """Returns the README's filter, with Table I's stochastic head on a reading instead of the image sensor."""
     return car_filter(lambda: VectorSensor(2, 2, in_key="reading"))
 
 
 def kitti_env(folder: str) -> EnvBase:
-    """A rendered drive of 200 frames, 150x50, held in memory; its frames are emitted, and nothing reads them."""
+    """Returns an environment of a rendered drive in memory, 200 frames of 150x50; no module reads the frames."""
     render_drives(folder, names=["00"], frames=200, processes=1, progress=None)
     return TransformedEnv(KITTIReplayEnv(folder, sequence="00", cache=None), Reading())
 
 
 def reacher_env() -> EnvBase:
-    """The arm with noisy encoders of examples/append_to_env.py."""
+    """Returns the arm with noisy encoders of examples/append_to_env.py."""
     return TransformedEnv(
         DMControlEnv("reacher", "easy"),
         Compose(
@@ -84,7 +84,7 @@ def reacher_env() -> EnvBase:
 
 
 def cases(folder: str) -> dict[str, tuple]:
-    """Makers of the environment and of its filter."""
+    """Returns functions that make the environment and its filter, by name."""
     states = torch.tensor([[0.0, 0.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])  # scales of the transition, rad and rad/s
     return {
         "KITTIReplayEnv, Table I's head": (lambda: kitti_env(folder), kitti_filter),
@@ -93,25 +93,25 @@ def cases(folder: str) -> dict[str, tuple]:
 
 
 class Stepper:
-    """Goes on with an environment."""
+    """Steps an environment with random actions."""
 
     def __init__(self, env: EnvBase):
         self.env, self.row = env, env.reset()
 
     def __call__(self) -> None:
-        """A step."""
+        """Runs one step."""
         _, self.row = self.env.step_and_maybe_reset(self.env.rand_action(self.row))
 
 
 def example_step(env: EnvBase, filter: DEnKF) -> TensorDict:
-    """Returns what a step of the environment gives the filter, to export from."""
+    """Returns the filter's input in a step of the environment, as an example for the export."""
     start = env.rand_action(env.reset())
     frame = env.step(start.copy())["next"].select("reading", "encoder", "observed", strict=False)
     return filter.initialise(frame.update(start.select("action", "state", strict=False)))
 
 
 def steppers(make_env, make_filter, folder: str) -> dict[str, Stepper]:
-    """The environment in its three ways."""
+    """Returns steppers of the environment: without the filter, with it, and with a packaged step."""
     filter = make_filter()
     example = example_step(make_env(), filter)
     path = export_step(filter, example, Path(folder) / f"{id(filter)}.pt2")
@@ -122,7 +122,7 @@ def steppers(make_env, make_filter, folder: str) -> dict[str, Stepper]:
 
 
 def measure(rounds: int = 41, steps: int = 50) -> dict[str, Timings]:
-    """Seconds a step of every round, by case and by kind."""
+    """Returns the seconds per step of every round, by case and by kind."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -130,12 +130,12 @@ def measure(rounds: int = 41, steps: int = 50) -> dict[str, Timings]:
 
 
 def cost_ms(timings: Timings, kind: str) -> float:
-    """Median over the rounds of what the transform adds to a step."""
+    """Returns the median over the rounds of the time that the transform adds to a step."""
     return 1e3 * median(b - a for a, b in zip(timings.rounds["without"], timings.rounds[kind], strict=True))
 
 
 def rows_of(name: str, timings: Timings) -> dict[str, Row]:
-    """Milliseconds that the transform adds to a step (no ratio but a time), by kind."""
+    """Returns rows with the milliseconds that the transform adds to a step (not a ratio), by kind."""
     rates = {kind: f"{1e6 / timings.micro(kind):,.0f}" for kind in timings.rounds}
     return {
         kind: Row(
@@ -144,28 +144,28 @@ def rows_of(name: str, timings: Timings) -> dict[str, Row]:
             TARGETS_MS[kind],
             ours_us=timings.micro(kind),
             theirs_us=timings.micro("without"),
-            note=f"not a ratio; {rates['without']} steps a second without, {rates[kind]} with",
+            note=f"not a ratio; {rates['without']} steps per second without, {rates[kind]} with",
         )
         for kind in ("filter", "packaged")
     }
 
 
 def rows(seconds: float) -> list[Row]:
-    """The same for ``make bench``, which takes as long as it takes."""
+    """Returns the rows for ``make bench``; ``seconds`` does not limit them."""
     return [row for name, timings in measure().items() for row in rows_of(name, timings).values()]
 
 
 def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
-    """The Markdown page."""
+    """Returns the Markdown page."""
     lines = [
-        "# What DEnKFTransform costs",
+        "# Cost of DEnKFTransform",
         "",
         "One environment, E = 32, one thread, processor time, no image read; medians over rounds of all three kinds in",
         "turn. A step is `env.step_and_maybe_reset(env.rand_action(...))`. Filter: `DEnKFTransform(filter)`; packaged:",
         "`DEnKFTransform(filter, packaged=load_step(export_step(filter, example, path)))`.",
         "Quietest: between the fastest rounds of either kind, which other work disturbed least.",
         "",
-        *head("environment and filter", "step", "steps/s without", "with", "added, ms a step", *LAST),
+        *head("environment and filter", "step", "steps/s without", "with", "added, ms per step", *LAST),
     ]
     for name, timings in found.items():
         for kind, row in rows_of(name, timings).items():
@@ -183,9 +183,9 @@ def table(found: dict[str, Timings], command: str, elapsed: float) -> str:
 
 @dataclass
 class TransformCost:
-    """Measures what DEnKFTransform adds to an environment's step at B = 1."""
+    """Measures the time that DEnKFTransform adds to an environment's step at B = 1."""
 
-    rounds: int = 41  # measurements of each
+    rounds: int = 41  # measurements of each kind
     out: Path | None = None  # write the table to this Markdown file
     smoke: bool = False  # one round of few steps: does it run?
 

@@ -1,13 +1,12 @@
-"""The work that all candidates share: Table I without the image sensor, S = 5, O = 2, E = 32, drop rate 26/256.
+"""The workload of all candidates: Table I without the image sensor, S = 5, O = 2, E = 32, drop rate 26/256.
 
 Transition (5, 32, 32, 64, 64, 5) with dropout, residual; observation (5, 32, 32, 64, 64, 2); noise of the observation
-(2, 16, 16, 2); ReLU everywhere; the sensor's samples are given. One set of weights, handed to every peer as numpy.
+(2, 16, 16, 2); ReLU everywhere; the sensor's samples are given. All peers get the same weights as numpy arrays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -33,7 +32,7 @@ from torch_denkf.modules import (
 
 STATE, OBSERVATION, MEMBERS = 5, 2, 32
 HIDDEN, NOISE_HIDDEN = (32, 32, 64, 64), (16, 16)
-RATE = 26 / 256  # 0.1, as a byte has it
+RATE = 26 / 256  # 0.1, rounded to a multiple of 1 / 256
 STD = 0.5  # of the observation noise before training
 PROCESS_STD = 0.1  # of the process noise of filters with a mean and a covariance
 POINTS = {"alpha": 1.0, "beta": 0.0, "kappa": 0.5}  # of the unscented transform
@@ -41,11 +40,11 @@ STEPS = 20  # of a sequence
 
 
 def make_filter(scheme: str = "sensor") -> DEnKF:
-    """The filter, with fixed weights; its gain is small enough that long sequences stay bounded.
+    """Returns the filter, with fixed weights; its gain is small enough that long sequences stay bounded.
 
     Args:
-        scheme: ``"sensor"`` reads samples ``("sensor", "ensemble")``; ``"perturbed"`` one reading a frame, of the
-            same name, ``[*B, O]``.
+        scheme: ``"sensor"`` reads samples ``("sensor", "ensemble")``; ``"perturbed"`` one reading per frame under the
+            same key, ``[*B, O]``.
     """
     torch.manual_seed(0)
     return DEnKF(
@@ -59,7 +58,7 @@ def make_filter(scheme: str = "sensor") -> DEnKF:
 
 
 def car_filter(sensor: Callable[[], SubModel]) -> DEnKF:
-    """The README's filter of a vehicle: state [x, y, theta, v, theta_dot], Table I's networks and noise."""
+    """Returns the README's filter of a vehicle: state [x, y, theta, v, theta_dot], Table I's networks and noise."""
     return DEnKF(
         transition=UnicycleTransition(velocity=StochasticMLP(2, 2), dt=0.103),
         sensor=sensor(),
@@ -71,7 +70,7 @@ def car_filter(sensor: Callable[[], SubModel]) -> DEnKF:
 
 
 def make_gaussian_filter(kind: str) -> EKF | UKF:
-    """A filter with a mean and a covariance on the same networks, without dropout, and constant Q and R.
+    """Returns a filter with a mean and a covariance on the same networks, without dropout, and constant Q and R.
 
     Its first belief is N(0, I), which its first reading updates.
 
@@ -96,20 +95,20 @@ def make_gaussian_filter(kind: str) -> EKF | UKF:
 
 
 def make_frames(batch: int, steps: int = STEPS, *, samples: bool = True) -> TensorDict:
-    """Frames ``[batch, steps]`` with the sensor's samples, or one reading each."""
+    """Returns frames ``[batch, steps]`` with the sensor's samples, or one reading each."""
     generator = torch.Generator().manual_seed(1)
     shape = (batch, steps, MEMBERS, OBSERVATION) if samples else (batch, steps, OBSERVATION)
     return TensorDict({("sensor", "ensemble"): torch.randn(shape, generator=generator)}, [batch, steps])
 
 
 def start(filter: DEnKF, batch: int) -> Tensor:
-    """An ensemble to start from, ``[batch, E, S]``."""
+    """Returns an initial ensemble, ``[batch, E, S]``."""
     torch.manual_seed(2)
     return filter.initial(TensorDict({}, [batch])).get(("belief", "ensemble"))
 
 
 def weights(filter: Filter) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Weight ``[out, in]`` and bias of every layer of the networks: three, or two where Q and R are constant."""
+    """Returns weight ``[out, in]`` and bias of every layer of the networks: three, or two for constant Q and R."""
     if isinstance(filter, DEnKF):
         networks = {name: filter[name].module for name in ("transition", "observation", "noise")}
     else:  # one module inside the other: the filter's step, the model, its network
@@ -121,23 +120,5 @@ def weights(filter: Filter) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
 
 
 def noise_floor(filter: DEnKF) -> tuple[np.ndarray, np.ndarray]:
-    """r^2 - c and c of the noise model, ``[O]`` each."""
+    """Returns r^2 - c and c of the noise model, ``[O]`` each."""
     return filter["noise"].variance.numpy().copy(), filter["noise"].floor.numpy().copy()
-
-
-def operations(batch: int) -> int:
-    """Floating-point operations of a step that cannot be avoided: products of matrices, and the masks' factors."""
-
-    def network(sizes: tuple[int, ...]) -> int:
-        return sum(2 * rows * columns for rows, columns in pairwise(sizes))
-
-    members = network((STATE, *HIDDEN, STATE)) + network((STATE, *HIDDEN, OBSERVATION)) + sum(HIDDEN)
-    members += 2 * OBSERVATION * (OBSERVATION + STATE) + 2 * OBSERVATION * STATE  # covariances; gain times shift
-    frame = network((OBSERVATION, *NOISE_HIDDEN, OBSERVATION)) + OBSERVATION**3
-    return batch * (MEMBERS * members + frame)
-
-
-def traffic(filter: DEnKF, batch: int) -> int:
-    """Bytes that a step must move: weights once, ensemble in and out, samples in, a byte a mask bit's draw."""
-    ensemble = batch * MEMBERS * (2 * STATE + OBSERVATION) * 4
-    return ensemble + batch * MEMBERS * sum(HIDDEN) + sum(p.numel() * 4 for p in filter.parameters())

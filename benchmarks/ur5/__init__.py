@@ -1,1 +1,1 @@
-"""A UR5 that one camera watches: joints, gripper and end effector."""
+"""Estimates joints, gripper and end effector of a UR5 from one camera."""

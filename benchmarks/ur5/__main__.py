@@ -27,18 +27,18 @@ METHOD = ("domain", "training", "sensor", "filter")
 
 
 def draw(study: Study) -> list[Path]:
-    """Draws the beliefs that a table left."""
+    """Draws the beliefs that a table saved."""
     names = [*(f"{name}, deg" for name in NAMES), "x, cm", "y, cm", "z, cm"]
     return list(draw_beliefs(study.out, names, [180 / math.pi] * len(NAMES) + [100.0] * 3, 0.08))
 
 
-AFTERWARDS = {"pictures": draw, "frontier": frontier, "members": members}  # what reads a table's folder
+AFTERWARDS = {"pictures": draw, "frontier": frontier, "members": members}  # commands that read a table's folder
 
 
 def smoke(study: Study) -> Study:
-    """Everything once, on few short demos with small pictures."""
+    """Returns a tiny study of everything, on few short demos with small images."""
     folder = Path(tempfile.mkdtemp(prefix="ur5-"))
-    # Demo 9 is the first that is tested on.
+    # Demo 9 is the first of the test demos.
     demos = {"size": 32, "demos": 12, "frames": 2, "sequences": 10, "real": 10, "real_train": 9, "steps": 30}
     budget = Budget(sensor=3, fine_tuning=2, motion=5, filter=2, end_to_end=1, length=6, batch=4)
     folders = {"root": folder / "demos", "out": folder / "out"}

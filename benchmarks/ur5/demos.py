@@ -1,4 +1,4 @@
-"""The collections of the study, and who trains, tunes, validates and is tested; by demo, never within one."""
+"""The collections of the study, and their split by demo into training, tuning, validation and test."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ STATE = 10  # J1..J6 rad, J7 the gripper's opening rad, x, y, z m
 class Collections:
     """Demos of the study: few frames of many in the simulator, whole sequences of some in both domains.
 
-    Demo i of the first two collections is the same episode. Those that the replay's hash puts on the test side are
-    tested on; of the others, the first numbers are sequences for the filter, which the sensor never sees, so that the
-    filter learns how wrong its sensor is on new demos; all the rest are the sensor's.
+    Demo i of the first two collections is the same episode. The replay's hash assigns demos to the test; of the
+    others, the first numbers are sequences for the filter, without training of the sensor, so that the filter learns
+    the sensor's errors on new demos; all the rest train the sensor.
     """
 
     root: Path = Path("runs/ur5-demos")  # folder of the demos
     out: Path = Path("runs/ur5")  # checkpoints, logs, table, beliefs, decoded pictures
-    size: int = 224  # side of the pictures in pixels
+    size: int = 224  # side of the images in pixels
     demos: int = 2000  # in the simulator, few frames each
     frames: int = 16  # drawn at random steps of each
-    sequences: int = 220  # of these demos, whole
-    tune: int = 80  # of these, at most so many train the filters
-    validation: int = 16  # and at most so many decide
-    real: int = 130  # demos of real_like, whole
+    sequences: int = 220  # number of these demos that are stored whole
+    tune: int = 80  # at most, of these, for training the filters
+    validation: int = 16  # at most, of these, for validation
+    real: int = 130  # whole demos of real_like
     real_train: int = 20  # of these, on the train side
-    pasted: int = 8000  # pictures of the simulator's states as the other camera sees them, to fine-tune with
+    pasted: int = 8000  # images of the simulator's states for real_like's camera, to fine-tune with
     steps: int = 350  # of a sequence
 
     def collect(self, processes: int = 1, *, real: bool = True) -> None:
-        """Collects what is missing, of ``real_like`` only if asked to."""
+        """Collects the missing demos, of ``real_like`` only with ``real``."""
         common = {"size": (self.size, self.size), "processes": processes, "max_steps": self.steps}
         collect_ur5_demos(self.root / "sim-frames", self.demos, frames=self.frames, **common)
         collect_ur5_demos(self.root / "sim-sequences", self.sequences, **common)
@@ -49,26 +49,26 @@ class Collections:
             collect_ur5_demos(self.root / "real_like-sequences", self.real, domain="real_like", **common)
 
     def replay(self, name: str, split: str, **kwargs) -> UR5ExperienceReplay:
-        """One collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""
+        """Returns one collection: ``"sim-frames"``, ``"sim-sequences"`` or ``"real_like-sequences"``."""
         return UR5ExperienceReplay(self.root / name, split=split, cache=self.out / "cache", **kwargs)
 
 
 def sequences_of(data: UR5ExperienceReplay, first: int) -> Tensor:
-    """States ``[N, T, 10]`` of demos from number ``first`` on: they need no pictures."""
+    """Returns states ``[N, T, 10]`` of demos from number ``first`` on, without images."""
     parts = [data.storage[e.start : e.start + e.length]["state"] for e in data.episodes if e.demo >= first]
     return torch.stack(parts)
 
 
 @dataclass
 class FramePool:
-    """Single frames in memory: pictures, uint8 ``[N, 3, H, W]``, and their states ``[N, 10]``."""
+    """Single frames in memory: images, uint8 ``[N, 3, H, W]``, and their states ``[N, 10]``."""
 
     pixels: Tensor
     state: Tensor
 
     @classmethod
     def of(cls, data: UR5ExperienceReplay, chosen: Sequence[int]) -> FramePool:
-        """Frames with a picture of chosen demos, of a replay with ``frames_only``."""
+        """Returns the frames of chosen demos, from a replay with ``frames_only``."""
         wanted = torch.tensor([episode.demo in chosen for episode in data.episodes])
         rows = wanted[data.storage[:]["episode"]].nonzero().squeeze(-1)
         if not len(rows):
@@ -83,27 +83,27 @@ class FramePool:
         return len(self.state)
 
     def shrunk(self, times: int) -> FramePool:
-        """Returns the same frames with so many times fewer rows and columns, averaged."""
+        """Returns the frames downsampled by a factor ``times`` in rows and columns, by averaging."""
         parts = [avg_pool2d(part.float(), times).round().to(torch.uint8) for part in self.pixels.split(512)]
         return FramePool(torch.cat(parts), self.state)
 
     def rows(self, index: Tensor) -> TensorDict:
-        """Frames with float pixels, ``[n]``."""
+        """Returns frames with float pixels, ``[n]``."""
         pixels = self.pixels[index].float() / 255
         return TensorDict({"pixels": pixels, "state": self.state[index]}, batch_size=[len(index)])
 
     def sample(self, generator: torch.Generator, batch: int) -> TensorDict:
-        """Random frames ``[batch]``."""
+        """Returns random frames ``[batch]``."""
         return self.rows(torch.randint(len(self), (batch,), generator=generator))
 
 
 def _numbers(collections: Collections, name: str, split: str, end: int) -> list[int]:
-    """Returns the demos of one side, numbered below ``end``: the folder may hold more than are asked for."""
+    """Returns the demos of one side with numbers below ``end``: the folder may have further ones."""
     return [episode.demo for episode in collections.replay(name, split).episodes if episode.demo < end]
 
 
 def sim_roles(collections: Collections) -> Roles:
-    """Roles in the simulator."""
+    """Returns the roles in the simulator."""
     frames = collections.replay("sim-frames", "train", frames_only=True)
     sequences = _numbers(collections, "sim-sequences", "train", collections.sequences)
     test = _numbers(collections, "sim-sequences", "test", collections.sequences)
@@ -113,7 +113,7 @@ def sim_roles(collections: Collections) -> Roles:
 
 
 def real_roles(collections: Collections) -> Roles:
-    """Roles in ``real_like``: of the few demos on the train side, two thirds train the sensor."""
+    """Returns the roles in ``real_like``: of the few demos on the train side, two thirds train the sensor."""
     train = _numbers(collections, "real_like-sequences", "train", collections.real)[: collections.real_train]
     test = _numbers(collections, "real_like-sequences", "test", collections.real)
     own = max(len(train) * 7 // 10, 1)

@@ -1,9 +1,9 @@
-"""The other domain's camera, found from its demos; and pictures of the simulator's arm as that camera would see it.
+"""Calibrates the other domain's camera on its demos, and renders the simulator's arm for that camera.
 
 A few demos show few poses: a sensor that learns from them alone memorises them. But their states are known, and so is
-the arm's shape. So the camera's pose, field of view and lens are those with which drawn silhouettes lie on what differs
-from the picture without the arm. Then the simulator's states, thousands of them, are drawn from there onto that
-picture, in the arm's colours.
+the arm's shape. So the camera's pose, field of view and lens are fitted until rendered silhouettes match the difference
+from the image without the arm. Then thousands of the simulator's states are rendered for that camera onto that image,
+in the arm's colours.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from torch_denkf.applications.ur5.simulation.render import GHOSTS, SCENERY, Rend
 from torch_denkf.applications.ur5.simulation.scene import UR5Scene
 
 SIDE = 112  # pixels, of the silhouettes
-DIFFERENT = 18  # grey levels by which the arm differs from what is behind it
-SHOTS = 100  # frames that the camera is found from
-# So many of them, silhouettes blurred by so many pixels, Gauss-Newton's steps; one after the other.
+DIFFERENT = 18  # grey levels, least difference between the arm and the background
+SHOTS = 100  # frames for the calibration of the camera
+# Stages of the calibration: number of frames, blur of the silhouettes in pixels, Gauss-Newton steps.
 Levels = Sequence[tuple[int, float, int]]
 LEVELS: Levels = ((40, 8.0, 8), (40, 4.0, 8), (60, 2.0, 8), (SHOTS, 1.0, 6))
-OFTEN = 0.35  # share of the frames in which a pixel shows the arm: where it is more, the median does, too
-UNITS = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.05, 2.0, 0.1])  # by which each number may be off
-HELD = 0.3  # share of the pictures with the object between the fingers
+OFTEN = 0.35  # largest share of frames in which a pixel shows the arm: above, the median may show it, too
+UNITS = np.array([0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.05, 2.0, 0.1])  # expected error of each parameter
+HELD = 0.3  # share of the images with the object between the fingers
 HOME = np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0, 0.4])
 
 
 class Drawn:
-    """Draws the arm, and nothing behind it, as a camera sees it.
+    """Renders the arm without background for a camera.
 
     Args:
-        side: of the pictures in pixels.
+        side: of the images in pixels.
         look: camera, lens, and light.
     """
 
@@ -51,16 +51,16 @@ class Drawn:
         self.look(look)
 
     def look(self, look: Domain) -> None:
-        """Puts the camera elsewhere."""
+        """Sets camera, lens and light."""
         apply_domain(self.scene, look)
         self.lens = Camera((self.side, self.side), look.distortion, (0.0, 0.0)).lens
 
     def arm(self, joints: np.ndarray, *, held: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Colours ``[H, W, 3]`` and share of each pixel that is covered ``[H, W]``, at joints ``[7]``.
+        """Returns colours ``[H, W, 3]`` and the covered share of each pixel ``[H, W]``, at joints ``[7]``.
 
         Args:
             joints: rad.
-            held: where an object is drawn, too, m from the table's centre ``[3]``.
+            held: place of an object to render, m from the table's centre ``[3]``; ``None`` for none.
         """
         pose = self.scene.pose_with(joints.astype(float))
         groups = (GHOSTS,) if held is None else (GHOSTS, SCENERY)
@@ -75,26 +75,26 @@ class Drawn:
 
 
 def without_arm(pixels: np.ndarray) -> np.ndarray:
-    """Returns what is behind the arm, ``[H, W, 3]``: the median of frames ``[N, H, W, 3]``."""
+    """Returns the background ``[H, W, 3]``: the median of frames ``[N, H, W, 3]``."""
     return np.median(pixels, 0)
 
 
 def foreground(pixels: np.ndarray, behind: np.ndarray) -> np.ndarray:
-    """Marks where frames ``[N, H, W, 3]`` show something else, ``[N, H, W]`` 0 or 1; each may be brighter."""
+    """Returns masks ``[N, H, W]`` of pixels that differ from the background, with a gain fitted to each frame."""
     gain = np.median(pixels / np.maximum(behind, 1.0), axis=(1, 2, 3), keepdims=True)
     return (np.abs(pixels - gain * behind).max(-1) > DIFFERENT).astype(np.float32)
 
 
 def look_of(numbers: np.ndarray) -> Domain:
-    """A camera by its place and target, m, its roll, rad, its field, degrees, and its lens's first number."""
+    """Returns a camera from place and target in m, roll in rad, field in degrees, and first distortion coefficient."""
     x, y, z, to_x, to_y, to_z, roll, field, bend = (float(value) for value in numbers)
     return Domain(camera=(x, y, z), target=(to_x, to_y, to_z), roll=roll, field=field, distortion=(bend, 0.0))
 
 
 def find_camera(pixels: np.ndarray, joints: np.ndarray, levels: Levels = LEVELS) -> tuple[Domain, float]:
-    """The camera that saw frames ``[N, S, S, 3]`` of the arm at joints ``[N, 7]``; and the share that does not fit.
+    """Fits the camera of frames ``[N, S, S, 3]`` to joints ``[N, 7]``; also returns the relative residual.
 
-    Gauss-Newton steps on silhouettes that are blurred less and less, from the simulator's camera on.
+    Runs Gauss-Newton steps on silhouettes with decreasing blur, from the simulator's camera.
     """
     small = np.stack([cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for frame in pixels])
     small = small.astype(np.float32)
@@ -109,7 +109,7 @@ def find_camera(pixels: np.ndarray, joints: np.ndarray, levels: Levels = LEVELS)
 
     for count, width, steps in levels:
         rows = order[:count]
-        # Where the arm mostly is, the frames' median shows it, too.
+        # Pixels that mostly show the arm are excluded, as the frames' median shows it, too.
         often = (silhouettes(found, order).mean(0) > OFTEN).astype(np.float32)
         counted = 1 - cv2.dilate(often, np.ones((int(2 * width) + 5,) * 2))
         seen = counted * _blurred(shown[rows], width)
@@ -117,7 +117,7 @@ def find_camera(pixels: np.ndarray, joints: np.ndarray, levels: Levels = LEVELS)
         def misfit(way: np.ndarray, start=found, rows=rows, seen=seen, counted=counted, width=width) -> np.ndarray:
             return (counted * _blurred(silhouettes(start + UNITS * (way - 1), rows), width) - seen).ravel()
 
-        # From one, not zero: the step of the differences is a share of it.
+        # Starts from one, not zero, because the step of the finite differences is relative.
         solution = least_squares(misfit, np.ones(len(found)), diff_step=0.1, max_nfev=steps)
         found = found + UNITS * (solution.x - 1)
         share = 2 * solution.cost / float(np.square(seen).sum())
@@ -130,7 +130,7 @@ def _blurred(masks: np.ndarray, width: float) -> np.ndarray:
 
 
 def colours(drawn: Drawn, pixels: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Gain and offset of red, green, and blue ``[2, 3]`` that make drawn arms look like those in frames."""
+    """Fits gain and offset of red, green, and blue ``[2, 3]`` from rendered arms to those in frames."""
     shown, before, after = foreground(pixels, without_arm(pixels)), [], []
     for frame, mask, row in zip(pixels, shown, joints, strict=True):
         picture, covered = drawn.arm(row)
@@ -143,12 +143,12 @@ def colours(drawn: Drawn, pixels: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 class Pasted:
-    """The simulator's arm as the other domain's camera would see it, before what is behind it there.
+    """Renders the simulator's arm for the other domain's camera, in front of that domain's background.
 
     Args:
         pixels: uint8 frames ``[N, 3, H, W]`` of demos in the other domain.
-        states: theirs ``[N, 10]``.
-        levels: of the search for the camera.
+        states: of these frames, ``[N, 10]``.
+        levels: stages of the camera's calibration.
     """
 
     def __init__(self, pixels: Tensor, states: Tensor, levels: Levels = LEVELS):
@@ -159,10 +159,10 @@ class Pasted:
         self.drawn, frames = Drawn(frames.shape[1], self.look), frames.astype(np.float32)
         self.behind = without_arm(frames)
         self.paint = colours(self.drawn, frames, joints)
-        self.grain = float(np.median(np.abs(frames - self.behind))) / 0.67 / 2  # much of it is light
+        self.grain = float(np.median(np.abs(frames - self.behind))) / 0.67 / 2  # halved: half is light
 
     def __call__(self, states: Tensor, seed: int = 0) -> Tensor:
-        """Pictures, uint8 ``[N, 3, H, W]``, of states ``[N, 10]``, in colours that vary a little."""
+        """Returns images, uint8 ``[N, 3, H, W]``, of states ``[N, 10]``, with slightly random colours."""
         rng, out = np.random.default_rng(seed), torch.empty(len(states), 3, *self.behind.shape[:2], dtype=torch.uint8)
         for index, state in enumerate(states.numpy()):
             held = state[7:] + 0.01 * rng.standard_normal(3) if rng.random() < HELD else None
@@ -176,7 +176,7 @@ class Pasted:
         return out
 
     def _light(self, rng: np.random.Generator) -> None:
-        """Turns the main light, and paints the object."""
+        """Draws the direction of the main light, and the object's colour."""
         model, way = self.drawn.scene.model, rng.standard_normal(3) * [1.0, 1.0, 0.2] - [0.0, 0.0, 1.0]
         model.light("main").dir[:] = way / np.linalg.norm(way)
         model.geom_rgba[self.drawn.scene.object_geom, :3] = rng.uniform(0.1, 0.9, 3)

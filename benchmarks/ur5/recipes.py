@@ -1,4 +1,4 @@
-"""Filters by name. One of your own: a :class:`UR5Recipe` with ``@register``."""
+"""Filters by name. To add a filter, decorate a :class:`UR5Recipe` with ``@register``."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from benchmarks.ur5.sensors import MEMBERS, NEAR, NearForecast, Preset, unit_of
 from torch_denkf.filters import Filter
 from torch_denkf.modules import DiagonalNoise, ImageSensor, ScaledNoise, SubModel
 
-WHITE = 0.7  # of the sensor's errors so much is new in each frame, and as much stays: 0.7^2 + 0.7^2 = 1
+WHITE = 0.7  # share of the sensor's errors that is white; the slow share is equal: 0.7^2 + 0.7^2 = 1
 INITIAL = 0.05  # standard deviation of the belief at the start of an episode, in those of the training states
-ARM_TAPER, PLACE_TAPER = 0.7, 0.8  # of joints among each other, and with the place: chosen on the validation demos
-GRIPPER = JOINTS - 1  # its opening says nothing about the other numbers
+ARM_TAPER, PLACE_TAPER = 0.7, 0.8  # between joints, and between joints and place: chosen on the validation demos
+GRIPPER = JOINTS - 1  # its opening is independent of the other components
 
 FILTERS = Registry()
 register = FILTERS.register
@@ -30,23 +30,23 @@ register = FILTERS.register
 class UR5Recipe(ArmRecipe):
     """A filter of an arm: all read the same sensor and begin with the same motion, near the true state.
 
-    What is inflated is all noise: Q, R, and the sensor's samples around their mean. Gains stay, and spreads grow by it.
-    Inflating the belief itself would do harm here: only the sum of a number and its bias is seen, and what they differ
-    by would grow.
+    Inflation multiplies all noise: Q, R, and the sensor's samples around their mean, so that gains stay and spreads
+    grow. Inflation of the belief itself would do harm here: only the sum of a component and its bias is observed, and
+    their difference would grow.
 
     Args:
-        sensor: whose trunk stays as it is, and whose head is trained with the filter.
-        preset: what it reads of a state.
+        sensor: with a frozen trunk, and a head that is trained with the filter.
+        preset: of the sensor.
         facts: statistics of the training demos.
         motion: trained before; the filter gets a copy.
-        error: root mean square error of what the sensor says of the state, ``[10]``, on demos it has not seen. It sets
-            how far R, bias and start are off before training.
+        error: root mean square error of the sensor's state, ``[10]``, on validation demos. It sets R, bias and start
+            before training.
         members: of an ensemble.
     """
 
     dims, unit, scaled = range(STATE), unit_of(STATE), (ScaledNoise, NearForecast)
     rates, moved, observation_key, first_key = ACCELERATIONS, (range(JOINTS), RATES), NEAR, "state"
-    # The place, too; joints and rates follow from the accelerations.
+    # Place, accelerations and biases; joints and rates follow from the accelerations.
     noisy = [*range(JOINTS, STATE), *ACCELERATIONS, *range(SIZE, SIZE + STATE)]  # noqa: RUF012
     forecast_key = ("forecast", "mean")
 
@@ -57,7 +57,7 @@ class UR5Recipe(ArmRecipe):
         self.members, self.error, self.bias_std = members, error, WHITE * error
         self.encoding = sensor.module["head"].layers[-1].in_features
         self.first_std = torch.cat([INITIAL * facts.scale, torch.zeros(SIZE - STATE)])
-        # As far as a filter is off in the long run, or it learns to hold on to where it began.
+        # As large as a filter's error in the long run, or the filter learns to trust its start.
         wrong = torch.maximum(2 * INITIAL * facts.scale, error)
         self.start_std = torch.cat([wrong, 0.3 * facts.rate, 0.5 * facts.acceleration])
 
@@ -74,7 +74,7 @@ class UR5Recipe(ArmRecipe):
 
     @property
     def process_std(self) -> Tensor:
-        """Returns what motion and bias do not know before training: 0.5 mm, usual jerks; biases stay as large."""
+        """Returns the process noise before training: 0.5 mm, usual jerks, and noise that keeps the biases' variance."""
         slow = (1 - self.motion.fading**2) ** 0.5 * self.bias_std
         return torch.cat([torch.full((3,), 0.0005), self.facts.jerk, slow])
 
@@ -91,7 +91,7 @@ class UR5Recipe(ArmRecipe):
         )
 
     def build(self) -> Filter:
-        """The filter, with its own sensor in front."""
+        """Returns the filter, including its sensor."""
         model = super().build()
         parts = OrderedDict(sensor=self.sensor, **{name: model[name] for name in model.module})
         return Filter(parts, initial=model.initial)
@@ -99,10 +99,10 @@ class UR5Recipe(ArmRecipe):
 
 @register
 class DEnKF(recipes.DEnKF, UR5Recipe):
-    """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples.
+    """The differentiable ensemble Kalman filter, with innovations of the sensor's samples.
 
     Attributes:
-        factors: whether covariances are weakened by ``taper``.
+        factors: whether ``taper`` damps covariances.
     """
 
     forecast_key = ("forecast", "ensemble")
@@ -110,11 +110,10 @@ class DEnKF(recipes.DEnKF, UR5Recipe):
 
     @property
     def taper(self) -> tuple[Tensor, Tensor] | None:
-        """Factors on the covariances of the state and the ten readings, and of the readings.
+        """Returns factors on the covariances of the state and the ten readings, and of the readings.
 
-        128 members show correlations of 0.09 where there are none. What one joint's reading says of another, and all
-        of them of the place, goes through the kinematics alone; the gripper's opening has nothing to do with the
-        others. Rates, accelerations and biases go with their joint.
+        128 members have spurious correlations of 0.09. Joints and place are related only by the kinematics; the
+        gripper's opening is independent of the others. Rates, accelerations and biases have the factors of their joint.
         """
         if not self.factors:
             return None

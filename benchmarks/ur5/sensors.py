@@ -17,22 +17,22 @@ from torch_denkf.applications.ur5.simulation.domains import SIM, Domain
 from torch_denkf.envs import Brightness, SaltAndPepper
 from torch_denkf.modules import ImageSensor, KeypointTrunk, SubModel, convolutional_trunk
 
-SAMPLES = 32  # of a sensor while it is trained
-MEMBERS = 128  # of the ensemble filters, whose states are 34 numbers; they read as many samples
+SAMPLES = 32  # of a sensor in training
+MEMBERS = 128  # of the ensemble filters, whose states have dimension 34; they read as many samples
 WRIST = 5  # J6, which turns the gripper
-UNDECIDED = 0.3  # length of (cos, sin) of J6 below which a reading leaves to the forecast which half turn it is
+UNDECIDED = 0.3  # length of (cos, sin) of J6 in a reading below which the forecast decides the half turn
 SALT = 0.02  # share of white pixels of a frame with salt and pepper, and of black ones
 NEAR = ("sensor", "near")  # readings as states, see NearForecast
-# What a good sensor leaves: units of all losses. 1.15 degrees; 1.15 degrees of each component; 0.25 cm.
+# Units of all losses, the errors of a good sensor: 1.15 degrees for each angle; 0.25 cm.
 JOINT_UNIT, PLACE_UNIT = 0.02, 0.0025
-REACH, RAISE = 0.36, 0.15  # half a patch's side and its shift upwards, in half pictures: hand and wrist
-COARSE = 112  # pixels: the side of the picture that the first look gets
+REACH, RAISE = 0.36, 0.15  # half a patch's side and its shift upwards, in half images: hand and wrist
+COARSE = 112  # pixels: the side of the coarse part's input
 
 
 def project(places: Tensor, look: Domain = SIM) -> Tensor:
-    """Projects places ``[*, 3]`` into a camera's picture: columns and rows ``[*, 2]`` from -1 (left, top) to 1.
+    """Projects places ``[*, 3]`` into a camera's image: columns and rows ``[*, 2]`` from -1 (left, top) to 1.
 
-    Only where the first looks go follows from it, so that roll and lens are left out.
+    Roll and lens are neglected, because only the initial place of the patch depends on it.
     """
     camera, target = torch.tensor(look.camera), torch.tensor(look.target)
     ahead = nn.functional.normalize(target - camera, dim=0)
@@ -44,27 +44,27 @@ def project(places: Tensor, look: Domain = SIM) -> Tensor:
 
 
 class Shrink(nn.Module):
-    """Averages pixels until a picture is at most :data:`COARSE` wide."""
+    """Downsamples images to a width of about :data:`COARSE` by averaging."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """Pictures ``[N, 3, H / n, W / n]``."""
+        """Returns images ``[N, 3, H / n, W / n]``."""
         times = images.shape[-1] // COARSE
         return nn.functional.avg_pool2d(images, times) if times > 1 else images
 
 
 def keypoint_trunk() -> nn.Module:
-    """The coarse trunk of both presets."""
+    """Returns the coarse trunk of both presets."""
     return nn.Sequential(Shrink(), KeypointTrunk(3, channels=(32, 48, 96, 128), keypoints=64, features=256))
 
 
 def glimpse_trunk(side: int) -> GlimpseTrunk:
-    """The trunk that looks at the gripper in pictures of a side of so many pixels."""
+    """Returns the trunk with a patch around the gripper, for images with ``side`` pixels along a side."""
     return GlimpseTrunk(keypoint_trunk(), CloseLook(side, REACH), 256, raised=RAISE)
 
 
 @torch.no_grad()
 def aim(trunk: GlimpseTrunk, images: Tensor, goal: Tensor) -> None:
-    """Sets the patch's centre by least squares to what :func:`project` says, ``[N, 2]``."""
+    """Fits the patch's centre by least squares to goals ``[N, 2]``, such as those of :func:`project`."""
     code = torch.cat([trunk.coarse(part) for part in images.split(128)])
     mean = code.mean(0)
     design = torch.cat([code - mean, torch.ones(len(code), 1)], -1).double()
@@ -75,26 +75,26 @@ def aim(trunk: GlimpseTrunk, images: Tensor, goal: Tensor) -> None:
 
 
 class TurnedWrist(nn.Module):
-    """Encodes what the better sensor reads: J6 by twice its angle, and by the angle itself.
+    """Encodes a state as a reading: J6 by twice its angle, and by the angle itself.
 
-    The fingers look the same after half a turn: a network that must name J6 itself hedges between two answers until it
-    sees the label on one side of the hand. Half of (cos, sin) of 2 J6 has one answer, and turns by one radian a radian.
-    Which of the two J6 it is say (cos, sin) of J6: short where the picture leaves that open.
+    The fingers look the same after half a turn: a network that predicts J6 itself averages between two solutions unless
+    it sees the label on one side of the hand. Half of (cos, sin) of 2 J6 is unique. (cos, sin) of J6 resolves the half
+    turn; predictions of it are short if the image is ambiguous.
     """
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, 13]`` of states ``[*, 10 or more]``: J1..J5, cos and sin twice, the opening, x, y, z."""
+        """Returns readings ``[*, 13]`` of states ``[*, >= 10]``: J1..J5, cos and sin of 2 J6, the opening, x, y, z."""
         once = state[..., WRIST : WRIST + 1]
         wrist = [0.5 * (2 * once).cos(), 0.5 * (2 * once).sin(), once.cos(), once.sin()]
         return torch.cat([state[..., :WRIST], *wrist, state[..., WRIST + 1 : STATE]], -1)
 
 
 def side_of(reading: Tensor, near: Tensor | None = None) -> Tensor:
-    """About where J6 is, ``[*]`` rad, to a quarter turn: what readings ``[*, 13]`` say.
+    """Returns J6, ``[*]`` rad, to within a quarter turn, from readings ``[*, 13]``.
 
     Args:
         reading: the mean of a sensor's samples.
-        near: where J6 is thought to be ``[*]``: decides where the picture does not; ``None`` for the picture alone.
+        near: a prior estimate of J6 ``[*]``, which decides ambiguous readings; ``None`` for the reading alone.
     """
     cos, sin = reading[..., WRIST + 2], reading[..., WRIST + 3]
     if near is None:
@@ -104,37 +104,37 @@ def side_of(reading: Tensor, near: Tensor | None = None) -> Tensor:
 
 
 def wrist_of(reading: Tensor, near: Tensor) -> Tensor:
-    """States ``[*, 10]`` of readings ``[*, 13]``; of the two J6 half a turn apart, that next to ``near`` ``[*]``."""
+    """Returns states ``[*, 10]`` from readings ``[*, 13]``, with the solution of J6 that is closest to ``near``."""
     angle = torch.atan2(reading[..., WRIST + 1], reading[..., WRIST]) / 2
     angle = angle + torch.pi * ((near - angle) / torch.pi).round()
     return torch.cat([reading[..., :WRIST], angle.unsqueeze(-1), reading[..., WRIST + 4 :]], -1)
 
 
 def _near(reading: Tensor, near: Tensor | None = None) -> Tensor:
-    """Encodes what a sensor reads that reads J6 itself."""
+    """Returns ``near``, or J6 of readings that include J6 itself."""
     return reading[..., WRIST] if near is None else near
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A sensor, what it should read of a true state, and what state a reading says."""
+    """A sensor, with the maps from a true state to its reading and back."""
 
     name: str
     build: Callable[[Statistics, int], ImageSensor]
     observe: Callable[[Tensor], Tensor]
     dim: int
-    state_of: Callable[[Tensor, Tensor], Tensor]  # of a reading, and of a J6 that is near
-    side_of: Callable[..., Tensor] = _near  # which J6 is near, of a reading and of a J6 that is thought to be
+    state_of: Callable[[Tensor, Tensor], Tensor]  # from a reading, and an estimate of J6
+    side_of: Callable[..., Tensor] = _near  # estimate of J6 from a reading and a prior estimate
     coarse: str | None = None  # a preset that is trained first, and whose trunk becomes this one's coarse part
 
 
 def unit_of(dim: int) -> Tensor:
-    """Units of a reading's components: the last three are a place."""
+    """Returns the units of a reading's components, of which the last three are a place."""
     return torch.cat([torch.full((dim - 3,), JOINT_UNIT), torch.full((3,), PLACE_UNIT)])
 
 
 def _moments(facts: Statistics) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of what :class:`TurnedWrist` reads."""
+    """Returns mean and standard deviation of the readings of :class:`TurnedWrist`."""
     loc, scale = facts.loc, facts.scale
     middle = torch.zeros(4), torch.tensor([0.35, 0.35, 0.7, 0.7])
     return tuple(
@@ -146,19 +146,19 @@ CELLS = (128, 64)
 
 
 def keypoint_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """A better one: places of features beside a coarse view, coordinate channels, J6 by twice its angle."""
+    """Returns a sensor with keypoints, a coarse view and coordinate channels, which reads J6 by twice its angle."""
     head = {"num_cells": CELLS, "layer": "dropout", "rate": 0.05}
     return camera_sensor(facts, keypoint_trunk(), samples, *_moments(facts), **head)
 
 
 def glimpse_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """Builds one with a second look at the gripper. Flipout learns how large its noise is; dropout's is what it is."""
+    """Returns a sensor with a patch around the gripper, and a flipout head, whose noise is learned."""
     head = {"num_cells": CELLS, "layer": "flipout"}
     return camera_sensor(facts, glimpse_trunk(facts.size[1]), samples, *_moments(facts), **head)
 
 
 def paper_sensor(facts: Statistics, samples: int = SAMPLES) -> ImageSensor:
-    """The paper's: Table I on the frame, which reads all ten numbers of the state."""
+    """Returns the paper's sensor: Table I on the frame, which reads all ten components of the state."""
     return camera_sensor(facts, convolutional_trunk(3), samples, facts.loc, facts.scale)
 
 
@@ -171,14 +171,14 @@ SENSORS = {preset.name: preset for preset in _PRESETS}
 
 
 def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, look: Domain = SIM, count: int = 1500) -> None:
-    """Gives a sensor with a second look a trained one's trunk, which stays as it is, and aims it at the gripper.
+    """Copies a trained trunk into a sensor with a patch, freezes it, and aims the patch at the gripper.
 
     Args:
-        sensor: with a second look.
-        coarse: trained.
-        pool: frames to aim by, some of them.
-        look: the camera that took these.
-        count: how many.
+        sensor: with a patch.
+        coarse: the trained sensor.
+        pool: frames, some of which are used to aim.
+        look: the camera of these frames.
+        count: number of frames.
     """
     trunk = sensor.module["trunk"]
     trunk.coarse.load_state_dict(coarse.module["trunk"].state_dict())
@@ -188,15 +188,15 @@ def adopt(sensor: ImageSensor, coarse: ImageSensor, pool: FramePool, look: Domai
 
 
 class NearForecast(SubModel):
-    """The sensor's samples as states; of the J6 half a turn apart those on the side that the picture shows.
+    """Maps the sensor's samples to states, and resolves the half turn of J6.
 
-    What a turned gripper looks like says which two angles are possible. Which of them it is says the mean of the
-    samples, see :func:`side_of`, and where that is undecided the forecast's mean. All members take the same, so
-    that an ensemble does not split. (Members that compare cosines each for itself do split: those a little more
-    than a quarter of a turn off are drawn to the other side, and the mean lies between.)
+    The image of a turned gripper has two solutions. The mean of the samples selects one, see :func:`side_of`, or the
+    forecast's mean if the samples are ambiguous. All members use the same solution, so that an ensemble does not split.
+    (If each member chose by itself, those with errors above a quarter turn would choose the other solution, and the
+    mean would lie between.)
 
     Args:
-        preset: whose ``state_of`` turns readings into states.
+        preset: with ``state_of``, which maps readings to states.
         forecast_key: the forecast's ensemble ``[*B, E, S]``, or mean ``[*B, S]``.
     """
 
@@ -205,7 +205,7 @@ class NearForecast(SubModel):
         self.preset, self.factor = preset, 1.0  # on the samples' distances from their mean
 
     def compute(self, samples, forecast, *, batch_size):
-        """The states ``[*B, E, 10]``."""
+        """Returns the states ``[*B, E, 10]``."""
         angle = forecast[..., WRIST]
         if angle.ndim > len(batch_size):
             angle = angle.mean(-1)
@@ -217,13 +217,12 @@ class NearForecast(SubModel):
 
 
 def disturb(frames: TensorDict, generator: torch.Generator, times: int = 1) -> TensorDict:
-    """Disturbs training frames as a camera does: a third get salt and pepper, a third another exposure.
+    """Augments training frames: a third get salt and pepper, a third another exposure.
 
     Args:
         frames: with pixels.
         generator: of all draws.
-        times: so many rows, and columns, of the camera's were averaged into one: of salt there are as many grains more,
-            each as much weaker.
+        times: downsampling factor of rows and columns: salt has ``times**2`` as many grains, each weaker by the same.
     """
     seed, area = int(torch.randint(2**31, (), generator=generator)), times**2
     own = torch.Generator().manual_seed(seed)
@@ -235,7 +234,7 @@ def disturb(frames: TensorDict, generator: torch.Generator, times: int = 1) -> T
 def train_preset(
     sensor: ImageSensor, preset: Preset, train: FramePool, held_out: FramePool, times: int = 1, **settings
 ) -> ImageSensor:
-    """Trains a sensor on frames that were shrunk so many times, see :func:`disturb`, and
+    """Trains a sensor on frames that were downsampled by ``times``, see :func:`disturb`, and
     :func:`~benchmarks.common.arm.sensors.train_sensor`.
     """
     terms = {"loss_joints": slice(-3), "loss_place": slice(-3, None)}

@@ -1,4 +1,4 @@
-"""Trained filters with other members: their errors against milliseconds a step, and how many they need."""
+"""Evaluates trained filters with other ensemble sizes: error against milliseconds per step, and localisation."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from benchmarks.ur5.study import Base, Study, members_of, sensor_rows, size_row,
 from benchmarks.ur5.training import INFLATIONS, with_missing
 from torch_denkf.training import choose
 
-SCHEMES = ("sensor", "perturbed", "sakov")  # of the DEnKF's update; "etkf" takes no localisation
-SHOWN = 3.0  # degrees, in the picture
+SCHEMES = ("sensor", "perturbed", "sakov")  # of the DEnKF's update; "etkf" supports no localisation
+SHOWN = 3.0  # degrees, largest error in the plot
 KINDS = ("none", "factors", "significance", "both")  # of localisation
 THRESHOLDS = (1.0, 1.5, 2.0, 3.0)
 
 
 def frontier(study: Study) -> list[Path]:
-    """Draws error against milliseconds a step of what the table left in ``--out``: frontier.csv, frontier.png.
+    """Draws error against milliseconds per step of the table's filters in ``--out``: frontier.csv, frontier.png.
 
-    Nothing is trained again. An update that a filter was not trained with gets its own inflation, chosen as training
-    chooses it, with the table's number of members.
+    Nothing is trained again. For an update that a filter was not trained with, the inflation is chosen as in training,
+    with the table's number of members.
     """
     for seed in study.seeds:
         base = Base(study, study.sensors[0], "sim", seed)
@@ -69,9 +69,9 @@ def _inflation(base: Base, recipe: UR5Recipe, saved: dict) -> float:
 
 
 def members(study: Study) -> list[Path]:
-    """Counts the members that the DEnKF needs, by localisation: members.csv and members.md in ``--out``.
+    """Tests the DEnKF with other ensemble sizes and localisations: members.csv and members.md in ``--out``.
 
-    Filters are trained once each, with few members, and tested with other numbers of members and other localisations.
+    Filters are trained once each, with few members.
     The validation demos choose the threshold; the factor on the noise stays that of the training.
     """
     for kind in study.sensors:
@@ -88,7 +88,7 @@ def members(study: Study) -> list[Path]:
 
 
 def members_page(frame: pd.DataFrame) -> str:
-    """A table of the rows, with a column for each localisation."""
+    """Returns a table of the rows, with a column for each localisation."""
     frame = frame.assign(cell=[_cell(row) for row in frame.to_dict("records")])
     table = frame.set_index(["sensor", "trained", "members", "localisation"])["cell"].unstack("localisation")
     text = "Clean test demos. Cells: joints, deg / end effector, cm / coverage of 90 %, and the threshold, if any."

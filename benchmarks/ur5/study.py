@@ -1,4 +1,4 @@
-"""The study's options, and the jobs of its table, each of which can be broken off and resumed."""
+"""The study's options, and the jobs of its table, each of which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 TRAININGS = ("sim", "fine_tuned")
 CONDITIONS = ("clean", "black20", "missing", "salt_and_pepper")
-SALTED = 3  # every third tuning demo is read with salt and pepper, too
+SALTED = 3  # every third tuning demo is also read with salt and pepper
 NAMES = tuple(f"J{number + 1}" for number in range(JOINTS))
 score_row = partial(scores.score_row, names=NAMES, unit=unit_of(STATE), circular=range(6))  # the gripper's is no angle
 
 
 @dataclass(frozen=True)
 class Study(Collections):
-    """A UR5 that one camera watches: joints, gripper and end effector, with every filter that is registered.
+    """Estimates joints, gripper and end effector of a UR5 from one camera, with every registered filter.
 
-    collect: demos into --root. table: collect what is missing, train, test. pictures: plots of what a table left in
-    --out. frontier: error against milliseconds a step of the filters that a table left there. members: DEnKFs that are
-    trained with few members, by localisation. What was broken off goes on where it stopped. See the README.
+    collect: demos into --root. table: collect what is missing, train, test. pictures: plots of a finished table in
+    --out. frontier: error against milliseconds per step of its filters. members: DEnKFs trained with few members, by
+    localisation. An interrupted run resumes. See the README.
     """
 
     command: Positional[Literal["collect", "table", "pictures", "frontier", "members"]] = "table"
@@ -56,16 +56,16 @@ class Study(Collections):
     trainings: some_of(TRAININGS) = TRAININGS
     seeds: tuple[int, ...] = (0,)
     sizes: tuple[int, ...] = (4, 8, 16, 32, 64, 128, 256, 512, 1024)  # of the ensemble, for one row each
-    localisations: tuple[str, ...] = ("factors", "significance")  # that members trains with
-    members: int = 64  # that members trains with
+    localisations: tuple[str, ...] = ("factors", "significance")  # in the trainings of the command members
+    members: int = 64  # in the trainings of the command members
     threshold: float = 1.5  # of significance in these trainings
-    processes: int = 1  # that collect
+    processes: int = 1  # that collect demos
     budget: OmitArgPrefixes[Budget] = field(default_factory=Budget)
     smoke: bool = False  # a tiny run of everything
 
 
 class Base:
-    """Holds what all filters of a sensor, a training and a seed share: sensor, statistics, motions, features of demos.
+    """Sensor, statistics, motion and features of demos, shared by all filters of a sensor, a training and a seed.
 
     Args:
         study: the study.
@@ -84,11 +84,11 @@ class Base:
 
     @cached_property
     def states(self) -> Tensor:
-        """States of the simulator's demos that the sensor may see, ``[N, T, 10]``."""
+        """Returns states of the simulator's demos for the sensor's training, ``[N, T, 10]``."""
         return sequences_of(self.study.replay("sim-frames", "train"), self.study.sequences)
 
     def _sensor(self) -> tuple[ImageSensor, Statistics]:
-        """The trained sensor. Its statistics lie beside it, so that a resumed study does not read the pictures."""
+        """Returns the trained sensor, whose statistics are saved with it, so that a resumed study reads no images."""
         out = self.folder(self.kind)
         if (out / "sensor.pt").exists() and (out / "facts.pt").exists():
             facts = Statistics(**read_checkpoint(out / "facts.pt"))
@@ -130,7 +130,7 @@ class Base:
         return self.study.out / "sensors" / f"{self.training}-{kind}-{self.seed}"
 
     def _pasted(self, pool: FramePool) -> tuple[FramePool, Domain]:
-        """Frames, and pictures of the simulator's states as the other domain's camera would take them; that camera."""
+        """Returns frames, images of the simulator's states by the other domain's camera, and that camera."""
         assert self.parent is not None
         states = self.parent.states.flatten(0, 1)
         generator = torch.Generator().manual_seed(self.seed)
@@ -142,7 +142,7 @@ class Base:
 
     @cached_property
     def motion(self) -> Motion:
-        """The motion, trained on true states."""
+        """Returns the motion, trained on true states."""
         if self.parent is not None:
             return self.parent.motion
         torch.manual_seed(self.seed)
@@ -151,7 +151,7 @@ class Base:
         return train_motion(motion, paths, AHEAD, out=out, seed=self.seed, updates=self.study.budget.motion)
 
     def codes(self, role: str, condition: str = "clean", domain: str | None = None) -> TensorDict:
-        """Features of the demos of a role, in a domain of which they may not be, with rates and accelerations."""
+        """Returns features of the demos of a role in a domain, with rates and accelerations."""
         domain = self.domain if domain is None else domain
         demos = getattr(self.roles if domain == self.domain else real_roles(self.study), role)
         salt = SaltAndPepper(generator=torch.Generator().manual_seed(0))
@@ -170,18 +170,18 @@ class Base:
 
     @cached_property
     def error(self) -> Tensor:
-        """Root mean square error of the sensor on the validation demos, ``[10]``."""
+        """Returns the root mean square error of the sensor on the validation demos, ``[10]``."""
         reading = read_all([self.sensor], self.codes("validation"), MEMBERS)
         truth = reading["state"]
         read = self.preset.state_of(reading["sensor", "ensemble"].mean(-2), truth[..., WRIST])
         return (read - truth).square().mean((0, 1)).sqrt()
 
     def recipe(self, name: str, size: int = MEMBERS) -> UR5Recipe:
-        """A filter's recipe, with a sensor of its own."""
+        """Returns a filter's recipe, with a copy of the sensor."""
         return FILTERS[name](deepcopy(self.sensor), self.preset, self.facts, self.motion, self.error, size)
 
     def train(self, name: str, recipe: UR5Recipe | None = None) -> tuple[UR5Recipe, Filter, Path]:
-        """Trains a filter, or reads it; by default that of the name's recipe."""
+        """Trains a filter, or loads it; by default that of the name's recipe."""
         recipe, out = recipe or self.recipe(name), self.study.out / "filters" / f"{name}-{self.name}"
         begin = None if self.parent is None else self.parent.train(name)[1]
         tune = [self.codes("tune"), self.codes("tune", "salt_and_pepper")]
@@ -190,7 +190,7 @@ class Base:
         return recipe, model, out
 
     def readings(self, sensor: ImageSensor, domain: str) -> dict[str, TensorDict]:
-        """Returns what a sensor reads of the test demos, in all conditions."""
+        """Returns a sensor's readings of the test demos, in all conditions."""
         clean, salted = (
             read_all([sensor], self.codes("test", name, domain), MEMBERS) for name in ("clean", "salt_and_pepper")
         )
@@ -200,7 +200,7 @@ class Base:
 def run_all(study: Study) -> None:
     """Trains and tests everything: all filters with the first sensor in the simulator, the DEnKF everywhere.
 
-    The simulator's DEnKF is tested on the changed domain, too, as it is. Leaves rows in ``--out/rows``.
+    The simulator's DEnKF is also tested on the changed domain without fine-tuning. Writes rows to ``--out/rows``.
     """
     for seed in study.seeds:
         for kind in study.sensors:
@@ -222,17 +222,17 @@ def run_all(study: Study) -> None:
 
 
 def members_of(name: str) -> int:
-    """Returns how many members a filter has in the table."""
+    """Returns the number of members of a filter in the table."""
     return MEMBERS if name == "denkf" else 1
 
 
 def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) -> list[dict]:
-    """The sensor alone; where it sees nothing, its last reading stays."""
+    """Returns rows of the sensor alone, with a zero-order hold."""
     rows = []
     for condition, reading in readings.items():
         truth, samples, seen = reading["state"], reading["sensor", "ensemble"], reading["observed"]
         near = preset.side_of(samples.mean(-2))
-        near = near + 2 * torch.pi * ((truth[..., WRIST] - near) / (2 * torch.pi)).round()  # whole turns do not count
+        near = near + 2 * torch.pi * ((truth[..., WRIST] - near) / (2 * torch.pi)).round()  # removes whole turns
         read = preset.state_of(samples.mean(-2), near)
         var = preset.state_of(samples, near.unsqueeze(-1).expand(samples.shape[:-1])).var(-2)
         out = scores.estimated(reading, hold_last(read, seen, truth[:, 0]), hold_last(var, seen, var[:, 0]))
@@ -241,10 +241,10 @@ def sensor_rows(preset: Preset, readings: dict[str, TensorDict], names: dict) ->
 
 
 def size_row(base: Base, recipe: UR5Recipe, saved: dict, names: dict, chunk: int | None = None) -> dict:
-    """A row of a trained filter with other members on clean demos, and its CRPS on the validation demos.
+    """Returns a row of a trained filter with other members on clean demos, and its CRPS on the validation demos.
 
-    With ``chunk``, ``ms_per_step`` is processor time of compiled chunks of so many steps, and ``eager_ms_per_step`` of
-    eager steps; 0 compiles nothing.
+    With ``chunk``, ``ms_per_step`` is processor time of compiled chunks of that many steps, and ``eager_ms_per_step``
+    of eager steps; 0 compiles nothing.
     """
     model, outs = read_filter(recipe, recipe.build(), saved), []
     for part in base.codes("test").split(8):  # a large ensemble of all demos takes gigabytes
@@ -263,7 +263,7 @@ def size_row(base: Base, recipe: UR5Recipe, saved: dict, names: dict, chunk: int
 
 
 def trained(base: Base, name: str, recipe: UR5Recipe | None = None) -> dict:
-    """Trains a filter, or reads it: its weights, with those of its sensor's head, and its inflation."""
+    """Trains or loads a filter, and returns its weights, with those of its sensor's head, and its inflation."""
     return read_checkpoint(base.train(name, recipe)[2] / "filter.pt")
 
 

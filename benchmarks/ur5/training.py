@@ -1,4 +1,4 @@
-"""The stages of a filter: on readings of the frozen sensor, then with the sensor's head; then its one number."""
+"""Trains a filter on readings of the frozen sensor, then with the sensor's head; then chooses its inflation."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ INFLATIONS = (0.75, 0.85, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0, 2.4)
 
 @dataclass(frozen=True)
 class Budget:
-    """Updates of each stage; the filter's windows."""
+    """Updates of each stage, and the size of the filter's windows."""
 
-    sensor: int = 6000  # updates of the sensor's coarse part; half as many of its second look
+    sensor: int = 6000  # updates of the sensor's coarse part; half as many of its patch network
     fine_tuning: int = 800  # updates of the simulator's sensor, on the other domain
     motion: int = 3000  # updates of the motion on true states
     filter: int = 250  # updates of a filter on readings
     end_to_end: int = 50  # updates of a filter with the sensor's head
-    length: int = 96  # steps of the filter's windows: over short ones slow errors do not show
-    batch: int = 12  # windows an update
+    length: int = 96  # steps of the filter's windows: short ones do not show slow errors
+    batch: int = 12  # windows in an update
 
 
 def with_missing(recipe: UR5Recipe, codes: TensorDict) -> TensorDict:
-    """Readings of clean demos, and the same with missing frames: what filters are validated on."""
+    """Returns readings of clean demos, and the same with missing frames, for validation."""
     readings = read_all([recipe.sensor], codes, recipe.members)
     return torch.cat([readings, fail(readings, "missing", seed=1)])
 
 
 class WithHead(nn.Module):
-    """The filter's objective with the sensor's head in front, and the head's own beside it."""
+    """Objective of a filter with the sensor's head, plus the loss of the head itself."""
 
     def __init__(self, objective: nn.Module, recipe: UR5Recipe):
         super().__init__()
@@ -52,7 +52,7 @@ class WithHead(nn.Module):
         self.register_buffer("unit", unit_of(self.preset.dim))
 
     def forward(self, codes: TensorDict) -> dict[str, Tensor]:
-        """All terms, of windows ``[B, T]`` of features."""
+        """Returns all terms for windows ``[B, T]`` of features."""
         windows = with_head([self.sensor], codes, self.size)
         own = crps_ensemble(windows["sensor", "ensemble"], self.preset.observe(codes["state"])) / self.unit
         return {**self.objective(windows), "loss_sensor": 0.5 * own[codes["observed"].squeeze(-1)].mean()}
@@ -68,24 +68,24 @@ def train_filter(
     budget: Budget,
     begin: Filter | None = None,
 ) -> Filter:
-    """Trains one filter on features of demos ``[N, T]``, or goes on where it was broken off.
+    """Trains one filter on features of demos ``[N, T]``, or resumes after an interruption.
 
     Args:
         recipe: with the trained sensor, whose head is changed.
-        tune: demos whose sensor has not seen them.
-        validation: demos to choose by.
-        out: checkpoints and logs.
+        tune: demos that the sensor was not trained on.
+        validation: validation demos.
+        out: folder for checkpoints and logs.
         seed: of all random numbers.
         budget: updates.
-        begin: a trained filter to begin with: learns at a fifth of the rate, for a third of the updates.
+        begin: a trained filter to start from, with a fifth of the rate and a third of the updates.
 
     Returns:
-        The model, on its best parameters, with its inflation.
+        The model with its best parameters and its inflation.
     """
     torch.manual_seed(seed)
     model, sensor, (share, rate) = recipe.build(), recipe.sensor, (1, 1.0) if begin is None else (3, 0.2)
     if begin is not None:
-        # How large errors are here says the recipe.
+        # The recipe sets the size of the errors in this domain.
         own = lambda name: name.startswith("module.sensor.") or name.endswith((".variance", ".floor"))  # noqa: E731
         model.load_state_dict({k: v for k, v in begin.state_dict().items() if not own(k)}, strict=False)
     read = lambda: with_missing(recipe, validation)  # noqa: E731
@@ -96,7 +96,7 @@ def train_filter(
         updates = max(budget.filter // share, 1)
         first = filter_stage(recipe, model, frozen, read(), updates, budget.batch, lr=5e-3 * rate)
         head = list(sensor.module["head"].parameters())
-        # R knows how wrong the sensor is on new demos; on those that it is now trained on it would forget.
+        # R was fitted to errors on new demos; the demos of this stage would make it overconfident.
         rest = parameters_without(model, {"noise", "sensor"} & set(model.module.keys()))
 
         def sample(generator: torch.Generator, _: int | None) -> TensorDict:
@@ -113,6 +113,6 @@ def train_filter(
         )
         return [first, second]
 
-    # After training the sensor's head stays as it is.
+    # After training the sensor's head is frozen.
     settings = {"inflations": INFLATIONS, "every": budget.filter // share // 4, "out": out, "seed": seed}
     return fit(recipe, model, stages, cache(read), **settings)

@@ -1,1 +1,1 @@
-"""A simulated robot on wheels, which the study of members and tests of motions share."""
+"""A simulated robot on wheels, for the study of members and tests of motions."""

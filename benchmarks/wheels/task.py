@@ -1,4 +1,4 @@
-"""A robot on wheels: a gyro at 100 Hz, wheels at 20 Hz, GPS at 1 Hz, and two errors that last."""
+"""A robot on wheels: a gyro at 100 Hz, wheels at 20 Hz, GPS at 1 Hz, and two biases."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["NAMES", "DT", "ensemble_filter", "gaussian_filter", "recordings"]
 
 DT = 0.01  # s
 NAMES = ("x", "y", "heading", "speed", "turn rate", "gyro bias", "wheel scale")
-#: Of the process noise of one step, and where a run starts: m, m, rad, m/s, rad/s, rad/s, 1.
+#: Standard deviations of the process noise of one step and of the initial state: m, m, rad, m/s, rad/s, rad/s, 1.
 PROCESS = [0.0, 0.0, 0.0, 0.05, 0.05, 1e-4, 1e-5]
 MEAN, STD = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0], [0.5, 0.5, 0.1, 0.3, 0.1, 0.02, 0.05]
 #: Standard deviations of the readings, and steps between two.
@@ -31,24 +31,24 @@ GYRO, WHEELS, GPS = (0.01, 1), (0.05, 5), (0.5, 100)
 
 
 def moved(state: Tensor) -> Tensor:
-    """States ``[*, 7]`` of a unicycle one step later: its speed goes to 1 m/s and its turn rate to zero in seconds."""
+    """Returns the next states ``[*, 7]`` of a unicycle whose speed decays to 1 m/s and turn rate to zero."""
     x, y, heading, speed, turn, bias, scale = state.unbind(-1)
     place = x + DT * speed * heading.cos(), y + DT * speed * heading.sin(), heading + DT * turn
     return torch.stack([*place, speed + 0.2 * DT * (1 - speed), turn - 0.2 * DT * turn, bias, scale], -1)
 
 
 def turn_rate(state: Tensor) -> Tensor:
-    """Returns what the gyro reads, with its bias."""
+    """Returns the gyro's reading, with its bias."""
     return state[..., 4:5] + state[..., 5:6]
 
 
 def wheel_speed(state: Tensor) -> Tensor:
-    """Returns what the wheels read, by their scale."""
+    """Returns the wheels' reading, with their scale."""
     return state[..., 3:4] * state[..., 6:7]
 
 
 def recordings(runs: int, steps: int, seed: int) -> TensorDict:
-    """True states ``[runs, steps, 7]``, readings and their masks."""
+    """Returns true states ``[runs, steps, 7]``, readings and their masks."""
     generator = torch.Generator().manual_seed(seed)
     draw = partial(torch.randn, generator=generator)
     state, states = torch.tensor(MEAN) + torch.tensor(STD) * draw(runs, 7), []
@@ -72,7 +72,7 @@ def _sensors() -> dict[str, FusedSensor]:
 
 
 def ensemble_filter(members: int, **options) -> FusedFilter:
-    """Square root updates of an ensemble, a sensor after the other; ``options`` of its analyses."""
+    """Returns an ensemble filter with square-root updates, sensor by sensor; ``options`` of its analyses."""
     return FusedFilter(
         LearnedTransition(moved, residual=False),
         _sensors(),
@@ -83,7 +83,7 @@ def ensemble_filter(members: int, **options) -> FusedFilter:
 
 
 def gaussian_filter() -> FusedFilter:
-    """The extended Kalman filter."""
+    """Returns the extended Kalman filter."""
     return FusedFilter(
         LearnedTransition(moved, residual=False),
         _sensors(),

@@ -133,7 +133,7 @@ def skip(app, what, name, obj, would_skip, options):
 
 
 def describe_constant(app, what, name, obj, options, lines):
-    """Shows the source's comment in the place of what the constant's type says about itself."""
+    """Shows the source's comment instead of what the constant's type says about itself."""
     if what == "data":
         package, _, constant = name.rpartition(".")
         lines[:] = [comment(importlib.import_module(package), constant)]

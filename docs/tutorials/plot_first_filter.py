@@ -115,8 +115,8 @@ error = (mean - unseen["state"])[:, 20:]
 differences = unseen["reading"].diff(dim=1)[..., 0] / DT
 rmse = error.square().mean((0, 1)).sqrt()
 inside = (error.abs() <= 1.645 * std[:, 20:]).float().mean((0, 1))
-print(f"angle: RMSE {rmse[0]:.3f} rad;  its 90 % intervals hold {100 * inside[0]:.0f} % of the truth")
-print(f"speed: RMSE {rmse[1]:.3f} rad/s; its 90 % intervals hold {100 * inside[1]:.0f} % of the truth")
+print(f"angle: RMSE {rmse[0]:.3f} rad;  90 % coverage {100 * inside[0]:.0f} %")
+print(f"speed: RMSE {rmse[1]:.3f} rad/s; 90 % coverage {100 * inside[1]:.0f} %")
 crude = (differences - unseen["state"][:, 1:, 1])[:, 20:].square().mean().sqrt()
 print(f"differences of the readings: RMSE {crude:.3f} rad/s")
 assert rmse[1] < 0.3 * crude
@@ -137,7 +137,7 @@ plt.show()
 # %%
 # From here
 # ---------
-# * Videos and tables of your own, pictures in the place of the reading: :doc:`plot_own_recordings`.
+# * Videos and tables of your own, pictures instead of the reading: :doc:`plot_own_recordings`.
 # * A sensor of your own: give ``sensor=ImageSensor(...)``, see :doc:`/how_to/own_sensor`.
-# * The known equation in the place of the network: see :doc:`/how_to/own_dynamics`.
+# * The known equation instead of the network: see :doc:`/how_to/own_dynamics`.
 # * The same filter in an environment or in a policy: see :doc:`plot_policy` and :doc:`/start/three_ways`.

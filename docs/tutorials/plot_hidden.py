@@ -151,7 +151,7 @@ for name, filter in filters.items():
     error = mean - test["state"][..., :2]
     for when, rows in (("seen", seen), ("hidden", hidden)):
         inside = (error.abs() < 1.645 * std)[rows].float().mean()
-        print(f"{name}, {when}: off by {error[rows].norm(dim=-1).mean():.1f} pixels, 90 % intervals hold {inside:.0%}")
+        print(f"{name}, {when}: off by {error[rows].norm(dim=-1).mean():.1f} pixels, 90 % coverage {inside:.0%}")
 
 # %%
 # One run
@@ -182,4 +182,4 @@ plt.show()
 # %%
 # From here
 # ---------
-# * :doc:`/how_to/hidden`: labels, what to do without them, and errors that last while the camera sees.
+# * :doc:`/how_to/hidden`: labels, what to do without them, and coloured noise while the camera sees.

@@ -1,5 +1,5 @@
 r"""
-A sensor that fails without a word
+A sensor that fails silently
 ==================================
 
 An arm's joint has an encoder. One day the encoder slips: for a while it reads a few degrees too much. Nothing in the
@@ -64,7 +64,7 @@ with torch.no_grad():
     sound, slipped = watched.sequence(swing(100)), watched.sequence(swing(100, slip=4.0))
 alarms = 1000 * sound["monitor", "alarm"].float().mean()
 delay = slipped["monitor", "alarm"][:, FROM:TO, 0].float().argmax(1).float()
-print(f"sound encoder: an alarm in {alarms:.1f} of 1,000 steps")
+print(f"encoder without faults: an alarm in {alarms:.1f} of 1,000 steps")
 print(f"slipped by 4 degrees: alarm {delay.median():.0f} steps later (median of 100 runs)")
 assert alarms < 4
 assert delay.median() <= 3
@@ -97,7 +97,7 @@ assert found[-1] > 0.95
 # :class:`~torch_denkf.monitoring.Gated` sums up the NIS of the last three readings before it lets the latest one
 # correct the belief. With ``response="reject"`` a reading above the limit is left out. ``"student"`` and ``"huber"``
 # enlarge its variance instead. That is right for single outliers. But a sensor that stays wrong draws the belief over,
-# a little in each step.  A gate that rejects goes on from the motion alone, and its uncertainty grows. ``patience``
+# a little in each step.  A gate that rejects continues from the motion alone, and its uncertainty grows. ``patience``
 # says for how many readings. Here the encoder slips by 10 degrees. A slip of 4 would get in: after 25 steps without a
 # reading the forecast is so uncertain that a reading 4 degrees off fits it.
 

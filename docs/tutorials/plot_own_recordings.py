@@ -15,8 +15,8 @@ reads from the picture pulls the guesses towards itself (the *analysis*).
 # %%
 # The files
 # ---------
-# This block stands for your laboratory: it writes 14 recordings of 8 s. Each is a video with 20 pictures a second and a
-# CSV table with 50 rows a second. Both clocks start at the same time. The pictures are small, grey and noisy.
+# This block stands for your laboratory: it writes 14 recordings of 8 s. Each is a video with 20 images per second and a
+# CSV table with 50 rows per second. Both clocks start at the same time. The pictures are small, grey and noisy.
 
 import csv
 import tempfile
@@ -38,7 +38,7 @@ from torch_denkf.plots import plot_bands, write_video
 from torch_denkf.training import FilterTrainer, Stage
 
 torch.manual_seed(0)
-FPS, RATE, SECONDS, SIZE = 20, 50, 8, (24, 32)  # pictures a second; rows a second; s; height and width of a picture
+FPS, RATE, SECONDS, SIZE = 20, 50, 8, (24, 32)  # pictures per second; rows per second; s; height and width of a picture
 folder = Path(tempfile.mkdtemp())
 
 
@@ -147,7 +147,7 @@ denkf = DEnKF(
 # ranked probability score* (CRPS): it is small where the samples are near the truth and as wide as they are wrong.
 # After some updates the trainer validates, and at the end it keeps the parameters with the smallest validation error:
 # that of the samples' mean in the first stage, that of the belief in the second. *RMSE* is the root of the mean squared
-# error. A training that is killed goes on from ``out`` when it is started again.
+# error. A training that is killed continues from ``out`` when it is started again.
 
 
 def sensor_error() -> dict[str, float]:
@@ -207,7 +207,7 @@ crude = (differences - late["state"][:, 1:, 1])[pairs].square().mean().sqrt()
 inside = ensemble_interval_coverage(late["belief", "ensemble"], late["state"], level=0.9)
 print(f"sensor alone, where it sees: angle {alone:.3f} rad, speed by differences {crude:.2f} rad/s")
 print(f"filter, hidden second too:   angle {error[0]:.3f} rad, speed {error[1]:.2f} rad/s")
-print(f"90 % intervals hold {inside[0]:.0%} of the angles and {inside[1]:.0%} of the speeds")
+print(f"90 % coverage: angles {inside[0]:.0%}, speeds {inside[1]:.0%}")
 assert alone < 0.15
 assert error[0] < 0.12
 assert error[1] < 0.7 * crude

@@ -17,7 +17,7 @@ filter into the policy, where the filter learns from the reward, too.
 # ``LinearGaussianEnv`` is a torchrl environment that is written in torch, so that gradients can go through it. Its
 # rewards are zero; a transform of ours writes the reward: it is negative, and the farther off the cart is and the
 # stronger the motor pushes, the smaller it is. A missing reading is NaN, which a network cannot read: ``HoldReading``
-# writes the last reading that arrived beside it, as ``"held"``. The state is [position in m, speed in m/s].
+# writes the last reading that arrived next to it, as ``"held"``. The state is [position in m, speed in m/s].
 
 import matplotlib.pyplot as plt
 import torch
@@ -168,7 +168,7 @@ assert weight[1, 2] > 3 * DT * 0.5
 # %%
 # With the wrong filter the carts run away. After the training the cost is about that of the policy on the belief. The
 # last column of the learned matrix is what a push does. Its second number began at a fifth of the real one, which is
-# ``3 * DT``, and has come near it. It need not meet it: the reward does not ask for the true motion, but for a belief
+# ``3 * DT``, and has come near it. It need not equal it: the reward does not ask for the true motion, but for a belief
 # with which the actor does well.
 #
 # One cart under the policy on the belief. The dotted line is the same cart, with the same gusts, under the policy on

@@ -1,5 +1,5 @@
 r"""
-Look back: where was the robot?
+Smoothing: where was the robot?
 ===============================
 
 A robot drives through a hall. It counts the turns of its wheels, so it knows how far it drives and how much it turns in
@@ -127,7 +127,7 @@ for name in ("belief", "smoothed"):
     inside = interval_coverage(
         out[name, "mean"][:, rows], out[name, "var"][:, rows], drives["state"][:, rows], level=0.9
     )
-    print(f"{name:8s} {error(name, rows):.2f} m off between markers; 90 % intervals hold {inside[:2].mean():.0%}")
+    print(f"{name:8s} {error(name, rows):.2f} m off between markers; 90 % coverage {inside[:2].mean():.0%}")
 assert error("smoothed", rows) < 0.6 * error("belief", rows)
 assert 0.8 < inside[:2].mean() < 0.98
 
@@ -184,4 +184,4 @@ assert apart < 0.5 * error("smoothed", torch.arange(STEPS) > 0)
 # From here
 # ---------
 # * Which smoother for which filter, masks, late readings, training through a smoother: :doc:`/how_to/smoothing`.
-# * Errors beside those of DAPPER, a library for data assimilation: :doc:`/results/smoothing`.
+# * Errors next to those of DAPPER, a library for data assimilation: :doc:`/results/smoothing`.

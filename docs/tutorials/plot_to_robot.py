@@ -82,7 +82,7 @@ assert abs(learned[1, 0] + 40 * DT) < 0.15
 # %%
 # The same random numbers everywhere
 # ----------------------------------
-# The filter draws random numbers in each step. ``draw_noise`` writes them beside the reading, and whatever runs the
+# The filter draws random numbers in each step. ``draw_noise`` writes them next to the reading, and whatever runs the
 # step then uses these numbers instead of its own. So several ways to run a step can be compared to the last digits.
 # Here the numbers of all steps are drawn in advance.
 
@@ -138,7 +138,7 @@ print(f"{free.name}: {free.stat().st_size / 1e3:.0f} kB")
 # On the robot
 # ------------
 # From here on nothing of the training is needed: ``load_step`` imports torch alone. A step takes a dictionary of
-# tensors and returns one. ``inputs`` says what it needs, and ``carry`` names what goes on to the next step. Names of
+# tensors and returns one. ``inputs`` says what it needs, and ``carry`` names what continues to the next step. Names of
 # nested entries have dots.
 
 step = load_step(free)

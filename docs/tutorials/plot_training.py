@@ -212,4 +212,4 @@ plt.show()
 # ---------
 # * What a filter that is wrong looks like without true states: :doc:`plot_diagnostics`.
 # * A loss of your own: :doc:`/how_to/own_loss`.
-# * Training in stages, which goes on after a kill: :py:obj:`~torch_denkf.training.FilterTrainer`.
+# * Training in stages, which continues after a kill: :py:obj:`~torch_denkf.training.FilterTrainer`.

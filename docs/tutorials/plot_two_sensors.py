@@ -3,7 +3,7 @@ Two sensors at different rates
 ==============================
 
 A cart drives on a rail. Its wheel has an encoder, which reads the speed 50 times a second. The encoder alone cannot say
-where the cart is: each reading is a little off, and the errors add up. A camera beside the rail sees four lamps, whose
+where the cart is: each reading is a little off, and the errors add up. A camera next to the rail sees four lamps, whose
 brightness depends on where the cart is. It sees the place, but only ten times a second, and somebody walks through the
 picture now and then.
 
@@ -16,7 +16,7 @@ is the estimate and whose spread says how sure the filter is. In each time step 
 # The recordings
 # --------------
 # The filter runs at 50 Hz, the rate of the faster sensor. A *mask* says in which steps a reading is there: a boolean
-# entry beside each sensor's readings. Where the mask is False, the reading may hold anything. Here it holds NaN.
+# entry next to each sensor's readings. Where the mask is False, the reading may hold anything. Here it holds NaN.
 #
 # The state is [position in m, speed in m/s]. The camera's four numbers are a curved function of the position, which the
 # filter does not know. It is learned.
@@ -73,7 +73,7 @@ print("steps with a picture: {:.0%}; with a reading of the encoder: {:.0%}".form
 # ------------------------
 # ``Filter`` takes a dictionary from *place* to module, in the order in which the modules run. Each sensor has its own
 # entries, and each analysis has its own mask, ``observed_key``. The first analysis writes its result under
-# ``"middle"``. The second analysis reads that in the place of the forecast, and writes the ``"belief"``.
+# ``"middle"``. The second analysis reads that instead of the forecast, and writes the ``"belief"``.
 #
 # ``VectorSensor`` is a network that turns the lamps into a position, with one sample for each guess. ``DiagonalNoise``
 # learns how far off that position is. The encoder needs no network: its reading is a speed already, and the error of a
@@ -172,7 +172,7 @@ for name, run in runs.items():
     rmse[name] = {part: state_errors(mean[:, rows], truth[:, rows]).rmse for part, rows in parts.items()}
     inside = interval_coverage(mean[:, settled], var[:, settled], truth[:, settled], level=0.9)
     errors = "; ".join(f"{part} {error[0]:.2f} m, {error[1]:.2f} m/s" for part, error in rmse[name].items())
-    print(f"{name:13s}: RMSE {errors}; 90 % intervals hold {inside[0]:.0%}, {inside[1]:.0%}")
+    print(f"{name:13s}: RMSE {errors}; 90 % coverage {inside[0]:.0%}, {inside[1]:.0%}")
 assert rmse["both"]["with pictures"][0] < 0.2 * rmse["encoder alone"]["with pictures"][0]
 assert (rmse["both"]["with pictures"] < 0.9 * rmse["camera alone"]["with pictures"]).all()
 assert rmse["both"]["without"][0] < 0.9 * rmse["camera alone"]["without"][0]

@@ -12,7 +12,7 @@ from torch_denkf.functional import kalman_predict, kalman_update
 from torch_denkf.modules import CholeskyNoise
 
 
-def test_a_step_is_the_kalman_filter_of_what_the_networks_say(float64):
+def test_step_equals_the_kalman_filter_with_the_networks_outputs(float64):
     F, Q, H, _ = linear_system()
     r = CholeskyNoise(2, constant=False, in_features=3, in_key="features", out_key=("sensor", "noise"))
     q = CholeskyNoise(2, r=0.3)

@@ -37,7 +37,7 @@ def linear(size, *, noise=None, initial=None, **kwargs):
 
 
 @pytest.mark.parametrize("iterations", [1, 4])
-def test_without_process_noise_it_is_the_kalman_smoother(float64, iterations):
+def test_without_process_noise_equals_the_kalman_smoother(float64, iterations):
     """Equals the ETKF after one iteration of a linear system, and further ones change nothing."""
     etkf = linear_denkf("etkf")
     frames = drive(3, 7)
@@ -57,7 +57,7 @@ class Given(SubModel):
         return samples
 
 
-def test_of_samples_the_mean_is_the_reading(float64):
+def test_mean_of_samples_is_the_reading(float64):
     F, _, H, R = linear_system()
     frames, initial = drive(3, 7), linear_denkf("etkf").initial
     expected = linear(6, initial=initial).sequence(frames.copy())
@@ -110,7 +110,7 @@ def test_gradients_are_those_of_finite_differences(float64):
     assert torch.autograd.gradcheck(smooth, [value.requires_grad_() for value in inputs])
 
 
-def test_what_it_cannot_do_it_says():
+def test_unsupported_options_raise():
     with pytest.raises(ValueError, match="draw noise of their own"):
         IEnKS(
             LearnedTransition(StochasticMLP(2, 2)),

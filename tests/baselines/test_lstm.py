@@ -27,7 +27,7 @@ def readings(batch, width=1, resets=True):
 
 
 def torch_lstm(filter, frames):
-    """Means, hidden and cell states of the last layer by ``torch.nn.LSTM`` with the same weights."""
+    """Returns means, hidden and cell states of the last layer by ``torch.nn.LSTM`` with the same weights."""
     update = filter["lstm"]
     lstm = nn.LSTM(update.in_size, update.hidden_size, update.num_layers, batch_first=True)
     weights = update.module["cells"].state_dict()
@@ -55,7 +55,7 @@ def test_a_sequence_is_torchs_lstm(float64, layers, batch, update_at_reset):
         assert out["belief", "var"][..., 0, :].equal(torch.tensor([4.0, 9.0]).expand(*batch[:-1], 2))
 
 
-def test_a_flag_tells_a_missing_reading_from_a_reading_of_zero(float64):
+def test_flag_distinguishes_missing_from_zero(float64):
     filter, frames = reader(), readings((3, 9))
     zeros = frames.copy().set("observation", torch.zeros(3, 9, 2)).set("observed", torch.ones(3, 9, 1).bool())
     missing = zeros.copy().set("observed", torch.zeros(3, 9, 1).bool())

@@ -26,7 +26,7 @@ def frames(batch, layers=1, width=2):
 
 
 def reference(update, inputs, hidden, cell):
-    """One layer, by torch's cell."""
+    """Returns one layer, by torch's cell."""
     cell_module = nn.LSTMCell(inputs.shape[-1], update.hidden_size)
     cell_module.load_state_dict(update.module["cells"][0].state_dict())
     flat = [part.reshape(-1, part.shape[-1]) for part in (inputs, hidden, cell)]

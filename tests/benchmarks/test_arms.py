@@ -12,7 +12,7 @@ from benchmarks.arms.sensor import FromPlaces, JointPlaces
 
 
 def physics_at(name, seed):
-    """An arm after a reset, what it emits as float32, and its simulator."""
+    """Returns an arm after a reset, what it emits as float32, and its simulator."""
     env = make_one(ARMS[name], pixels=False)
     env.set_seed(seed)
     emitted = env.reset().float()
@@ -20,7 +20,7 @@ def physics_at(name, seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_reacher_knows_where_finger_and_target_are(seed):
+def test_reacher_positions_of_finger_and_target(seed):
     arm, emitted, physics = physics_at("reacher", seed)
     angles, velocity = arm.split(arm.state(emitted))
     at = {name: torch.tensor(physics.named.data.geom_xpos[name, :2]).float() for name in ("finger", "target")}

@@ -34,7 +34,7 @@ def test_perfect_sensors_lead_where_the_body_is(float64):
     assert SO3().distance(turns[:, -1], data["orientation"][:, -1]).max() < 1e-4
 
 
-def test_filters_find_up_where_nothing_pushes_and_the_bias_that_it_shows(float64):
+def test_tilt_and_gyro_bias_converge_without_acceleration(float64):
     """At rest, tilted; both start 10 degrees off. The bias about up cannot be seen."""
     truth = SO3().exp(torch.tensor([[0.5, -0.4, 1.0]]))
     wrong = SO3().plus(truth, torch.tensor([[0.17, 0.0, 0.0]])).numpy()

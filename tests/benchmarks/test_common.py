@@ -35,7 +35,7 @@ def test_rows_are_picked_and_lined_up():
     assert [*head("a", 5), line(1, "x")] == ["| a | 5 |", "|---|---|", "| 1 | x |"]
 
 
-def test_a_table_of_mixed_columns_comes_back_as_it_was_written(tmp_path):
+def test_table_of_mixed_columns_round_trip(tmp_path):
     rows = [{"name": "b", "seed": 2, "error": 1 / 3, "count": 123456}, {"name": "a", "seed": 1}]
     frame = write_table(rows, tmp_path / "table.csv", ("name",))
     assert (tmp_path / "table.csv").read_text() == "name,seed,error,count\na,1,,\nb,2,0.33333,123456\n"

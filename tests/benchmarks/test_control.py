@@ -19,14 +19,14 @@ def env_of(task, arm, count=4, cell=(0.2, 0.3), seed=0):
 
 
 def test_the_exact_filter_holds_the_truth():
-    """Its errors have the variances that it believes: chi-square of all of them, two a step."""
+    """The squared normalised errors are chi-square distributed, with two degrees of freedom per step."""
     env = make_env(TASKS["hike"], ARMS["Kalman"], 500, (0.4, 0.0), 0, hike.exact_filter(0.4))
     data = env.rollout(hike.STEPS)["next"]
     errors = (data["belief", "mean"] - data["state"]).square() / data["belief", "var"]
     assert errors[:, -1].mean().item() == pytest.approx(1, abs=5 * (2 / 1000) ** 0.5)
 
 
-def test_what_is_seen_is_the_last_reading_and_the_last_action():
+def test_policy_input_is_last_reading_and_last_action():
     env = env_of("pendulum", "last reading", count=50)
     data = env.rollout(20)
     seen, reading, observed, action = (data[key] for key in ("seen", "observation", "observed", "action"))

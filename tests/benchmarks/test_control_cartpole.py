@@ -35,7 +35,7 @@ def test_physics_and_reward_are_those_of_dm_control():
     assert data["next", "state"][:, -1, 3:].abs().max() > 0.1
 
 
-def test_the_filter_that_knows_the_world_errs_as_it_believes():
+def test_filter_with_the_true_model_is_consistent():
     torch.manual_seed(0)
     env = make_env(TASKS["cartpole"], ARMS["physics"], 40, (0.1, 0.0), 0, cartpole.exact_filter(0.1, 24))
     belief = env.rollout(60)["next"]
@@ -45,7 +45,7 @@ def test_the_filter_that_knows_the_world_errs_as_it_believes():
 
 
 def still_filter(members=8):
-    """One without process noise, that starts at given members: all its steps are determined."""
+    """Returns one without process noise, that starts at given members: all its steps are determined."""
     filter = cartpole.unlearned_filter(members)
     torch.manual_seed(0)
     start = torch.tensor(cartpole.START) + 0.1 * torch.randn(members, 5)
@@ -55,7 +55,7 @@ def still_filter(members=8):
     return filter
 
 
-def test_what_the_filter_is_told_is_what_the_analysis_uses():
+def test_analysis_uses_the_given_noise():
     """The first belief is the Kalman update of the prior's members, with R = 0.3^2 while it is told so."""
     filter = still_filter()
     reading = torch.tensor([[0.5, -0.5, 0.5]])
@@ -79,7 +79,7 @@ def test_what_the_filter_is_told_is_what_the_analysis_uses():
     assert not torch.allclose(belief()[0], update(0.3)[0], atol=1e-3)
 
 
-def test_what_comes_after_a_time_limit_counts():
+def test_value_bootstraps_after_a_time_limit():
     """A step's worth is r + gamma V, also where an episode ends by its length; r alone where it is terminated."""
     agent = SAC(ARMS["truth"], Inputs(0, 1, SCALE, 1.0), Settings(gamma=0.9), 1)
     flags = {"done": torch.ones(2, 1, dtype=torch.bool), "terminated": torch.tensor([[False], [True]])}

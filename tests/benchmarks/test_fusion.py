@@ -15,7 +15,7 @@ def task():
     return car_task(None, frames=8)
 
 
-def test_faults_are_where_they_are_said_to_be(task):
+def test_faults_are_in_the_given_steps(task):
     generator = torch.Generator().manual_seed(0)
     begin, end = torch.tensor([10, 10]), torch.tensor([20, 20])
     for fault in ("frozen", "offset", "noise"):

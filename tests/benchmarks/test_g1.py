@@ -15,7 +15,7 @@ from torch_denkf.data import LeRobotReplay
 
 
 def readings(count=4, steps=60):
-    """A sensor that is right, of episodes of which the others are shorter than the first."""
+    """Returns a sensor that is right, of episodes of which the others are shorter than the first."""
     valid = torch.ones(count, steps, 1, dtype=torch.bool)
     valid[1:, 30:] = False
     truth = torch.randn(count, steps, JOINTS, generator=torch.Generator().manual_seed(0))
@@ -42,7 +42,7 @@ def test_no_episode_has_two_roles(tmp_path):
 # Failing cameras ------------------------------------------------------------------------------------------------------
 
 
-def test_of_black_frames_nothing_is_left():
+def test_black_frames_are_removed():
     clean = readings()
     dark = fail(clean, "black20")
     assert fail(clean, "clean")["observed"].equal(clean["observed"])
@@ -68,7 +68,7 @@ def test_windows_stay_within_an_episode_and_lose_no_first_frame():
 # Scores ---------------------------------------------------------------------------------------------------------------
 
 
-def test_scores_leave_out_what_does_not_count():
+def test_scores_exclude_masked_rows():
     clean = readings()
     mean = clean["state"] + torch.tensor([0.01] * 6 + [0.08])
     mean[:, 0], mean[2, 40:] = 99.0, 99.0

@@ -80,7 +80,7 @@ def test_gains_are_those_of_clean_unseen_drives():
     torch.testing.assert_close(log_gains(fold, base), torch.tensor([0.03, -0.04]), rtol=1e-4, atol=0)
 
 
-def test_every_filter_predicts_what_a_sensor_with_a_gain_reads():
+def test_filters_predict_readings_of_a_sensor_with_gain():
     sensor = SENSORS["flow"](facts := Statistics(torch.zeros(2), torch.ones(2), torch.zeros(2), torch.ones(2), 0.1))
     for name in ("denkf", "dekf", "bkf", "dpf_m_lrn"):
         recipe = FILTERS[name](sensor, facts)
@@ -108,7 +108,7 @@ def facts():
 
 
 def smooth_drive(count, encoding):
-    """Readings of a flow sensor over gaps, with errors of 0.02, from a drive of ``count`` steps."""
+    """Returns readings of a flow sensor over gaps, with errors of 0.02, from a drive of ``count`` steps."""
     velocity = torch.stack([8 + 2 * torch.linspace(0, 6, count).sin(), 0.1 * torch.linspace(0, 4, count).cos()], -1)
     path = dead_reckoning(velocity.double(), torch.zeros(3, dtype=torch.float64), 0.1).float()
     sums = torch.stack([sum(torch.roll(velocity, lag, 0) for lag in range(n)) for n in range(1, LONGEST + 1)], 1)

@@ -14,7 +14,7 @@ def robot():
 
 
 def true_mean(robot):
-    """A belief that holds the truth, of the sensor on the base; feet are zero."""
+    """Returns a belief that holds the truth, of the sensor on the base; feet are zero."""
     true, sensor = robot.log["true"], LegKinematics(robot.model, **robot.names).base
     turn = SO3().compose(true["orientation"], sensor[:4].expand_as(true["orientation"]))
     place = true["position"] + rotate(true["orientation"], sensor[4:])

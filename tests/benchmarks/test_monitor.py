@@ -1,4 +1,4 @@
-"""The study's scores, against closed forms and scikit-free counts."""
+"""Scores of the monitoring study, against closed forms and counts by hand."""
 
 import pytest
 import torch
@@ -8,16 +8,16 @@ from benchmarks.monitor.drives import believed_spans
 from benchmarks.monitor.scores import Run, afterwards, auroc, detection, false_alarms
 
 
-def test_auroc_counts_pairs():
+def test_auroc_is_the_share_of_ordered_pairs():
     score, positive = torch.tensor([3.0, 1.0, 2.0, 2.0]), torch.tensor([True, False, True, False])
     assert auroc(score, positive) == pytest.approx((1 + 1 + 1 + 0.5) / 4)
     torch.manual_seed(0)
     normal = torch.randn(4000) + torch.tensor([0.0, 1.0]).repeat(2000)
-    expected = torch.special.ndtr(torch.tensor(0.5**0.5)).item()  # of two normal variables, one apart
+    expected = torch.special.ndtr(torch.tensor(0.5**0.5)).item()  # two unit normal variables with means 0 and 1
     assert auroc(normal, torch.tensor([False, True]).repeat(2000)) == pytest.approx(expected, abs=0.02)
 
 
-def test_detection_leaves_out_what_follows_a_fault():
+def test_detection_scores_exclude_the_steps_after_a_fault():
     fault = torch.zeros(40, dtype=torch.bool)
     fault[10:20] = True
     alarm = torch.zeros(40, dtype=torch.bool)
@@ -33,7 +33,7 @@ def test_detection_leaves_out_what_follows_a_fault():
     assert afterwards(torch.arange(40.0).unsqueeze(0), fault, 5).tolist() == [[30, 31, 32, 33, 34]]
 
 
-def test_the_shortest_pair_that_is_believed():
+def test_shortest_accepted_frame_pair_is_chosen():
     def reading(steps):
         entries = {"ensemble": torch.full((4, 2, 2), float(steps)), "encoding": torch.zeros(4, 3)}
         seen = torch.ones(4, 1, dtype=torch.bool)

@@ -22,7 +22,7 @@ def test_one_reading_in_five_is_wrong():
     )
 
 
-def test_the_contaminated_update_is_near_what_can_be_known():
+def test_contaminated_update_is_near_the_optimum():
     data = recordings(12, 5)
     truth = scores(*best(data, 2000).values())
     assert 0.8 < truth["held"] < 0.97

@@ -18,7 +18,7 @@ def _double(float64):
 
 
 def driven(count=240, runs=4, seed=0, slips=True):
-    """Drives as the filters take them to be: readings and poses ``[C, T]``; each ninth row is not seen."""
+    """Returns drives as the filters take them to be: readings and poses ``[C, T]``; each ninth row is not seen."""
     torch.manual_seed(seed)
     data = TensorDict({"motion": SE3().neutral(torch.zeros(7)).expand(runs, count, 7).clone()}, [runs, count])
     data["motion_cov"] = torch.diag_embed(torch.tensor([1e-4] * 3 + [2e-3] * 3).square()).expand(runs, count, 6, 6)
@@ -54,7 +54,7 @@ def driven(count=240, runs=4, seed=0, slips=True):
     return data, poses
 
 
-def test_intervals_hold_what_they_claim_of_errors_that_are_drawn():
+def test_coverage_of_simulated_errors_is_nominal():
     truth, var = SE3().exp(0.1 * torch.randn(500, 2, 6)), torch.rand(500, 2, 6) * 1e-4
     mean = SE3().perturb(truth, var.sqrt(), torch.randn(500, 2, 6))
     held = Claim(mean, var, truth).held()
@@ -63,8 +63,8 @@ def test_intervals_hold_what_they_claim_of_errors_that_are_drawn():
 
 
 @pytest.mark.parametrize("kind", ["EKF", pytest.param("DEnKF", marks=pytest.mark.slow)])
-def test_relative_motions_are_as_far_off_as_a_filter_claims(kind):
-    """Drives that are what the filter takes them for, with errors that last: over 1, 10 and 100 rows."""
+def test_relative_motion_errors_match_their_covariance(kind):
+    """Drives that are what the filter takes them for, with coloured noise: over 1, 10 and 100 rows."""
     data, poses = driven()
     options = {} if kind == "EKF" else {"members": 64, "localisation": "significance"}
     means = run(car_filter(kind, **options), prepared(data))["belief", "mean"]
@@ -74,7 +74,7 @@ def test_relative_motions_are_as_far_off_as_a_filter_claims(kind):
     assert ((held > 0.8) & (held < 0.98)).all(), held
 
 
-def test_the_last_velocity_is_held_where_no_motion_is_seen():
+def test_zero_order_hold_of_the_velocity():
     step = SE3().exp(torch.tensor([0.0, 0.1, 0.0, 0.0, 0.0, 1.0]))
     motions = step.expand(5, 7).clone()
     motions[3] = SE3().neutral(step)

@@ -9,7 +9,7 @@ from benchmarks.smoothing.gaussian import Series
 
 
 def series_for_tests(target=True, count=3, steps=14):
-    """Two quantities that follow targets, or walk; a reading with a slow error; the first frame is not read."""
+    """Returns two quantities that follow targets, or walk; a reading with a slow error; the first frame is not read."""
     truth = torch.randn(count, steps, 2).cumsum(1)
     reading = truth + 0.5 * torch.randn(count, 1, 2) + 0.3 * torch.randn(count, steps, 2)
     observed = torch.rand(count, steps, 1) < 0.8

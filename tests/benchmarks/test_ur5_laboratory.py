@@ -18,7 +18,7 @@ SIDE = 112
 
 @pytest.fixture(scope="module")
 def seen():
-    """Frames of random poses before a wall of stripes, as the camera TRUE sees them; and the joints."""
+    """Yields frames of random poses before a wall of stripes, as the camera TRUE sees them; and the joints."""
     rng, drawn = np.random.default_rng(0), Drawn(SIDE, look_of(TRUE))
     joints = laboratory.HOME + rng.uniform(-0.6, 0.6, (30, 7)) * [1, 0.6, 0.6, 1, 1, 3, 0.4]
     stripes = 90.0 + 30.0 * np.sin(np.arange(SIDE) / 5)[None, :, None] + np.zeros((SIDE, SIDE, 3))

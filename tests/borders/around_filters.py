@@ -27,17 +27,17 @@ FRAMES = TensorDict({"observation": torch.zeros(3, 5, 2), "state": torch.zeros(3
 
 
 def still(members: int = 8) -> dict[str, Any]:
-    """The modules of a filter of two states, both of which are observed, with a motion without noise."""
+    """Returns the modules of a filter of two states, both of which are observed, with a motion without noise."""
     return {**parts(members), "transition": LearnedTransition(torch.nn.Linear(2, 2))}
 
 
 def iterated() -> IEnKS:
-    """An iterated smoother."""
+    """Returns an iterated smoother."""
     return IEnKS(**still(), observation_key="observation")
 
 
 def particles() -> ParticleFilter:
-    """A particle filter whose motion has a density."""
+    """Returns a particle filter whose motion has a density."""
     likelihood = GaussianLikelihood(observation_key="observation")
     return ParticleFilter(**still(16), likelihood=likelihood, process_noise=0.1)
 
@@ -129,7 +129,7 @@ def _environments() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All arguments."""
+    """Yields all arguments."""
     kinds = {"smoothers": _smoothers, "transforms": _transforms, "losses": _losses, "environments": _environments}
     for border, subjects in kinds.items():
         yield from targets_of(border, *subjects())

@@ -1,4 +1,4 @@
-"""Constructors of filters."""
+"""Arguments of the filters' constructors."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from torch_denkf.filters import DPF, EKF, UKF, DEnKF, Filter, KalmanFilter, Mixt
 
 EYE = torch.eye(2)
 STDS = d.vector(2, negative=False)
-#: Matrices of another precision than the other arguments', too.
+#: One case has another precision than the other arguments.
 TRANSITION = d.matrix(2, 2) | {"double precision": EYE.double()}
-OBSERVATION = TRANSITION.but("a row more")  # that is another number of readings
+OBSERVATION = TRANSITION.but("a row more")  # a further row is valid: it is one more component of the observation
 SIGMA = {"alpha": d.POSITIVE, "beta": d.FINITE, "kappa": d.FINITE | {"minus the dimension": -2.0}}
 IMAGE_SHAPE = d.of((24, 24), (3, 0, 24), (3, -24, 24), "big")
 
 
 def parts(members: int = 8) -> dict[str, Any]:
-    """The modules of an ensemble or particle filter of two states, both of which are observed."""
+    """Returns the modules of an ensemble or particle filter with two state components, both observed."""
     return {
         "transition": m.LearnedTransition(m.StochasticMLP(2, 2, (4,))),
         "sensor": None,
@@ -37,7 +37,7 @@ def parts(members: int = 8) -> dict[str, Any]:
 
 
 def step_on_zeros(filter: Filter) -> Any:
-    """Two steps, as a robot takes them."""
+    """Resets a filter, and takes two steps."""
     row = filter.initialise(TensorDict({"observation": torch.zeros(2), "features": torch.zeros(4)}))
     return filter.step(filter.step(row))
 
@@ -54,7 +54,7 @@ def _made(modules: Any, initial: Any, variance_ceiling: Any = None) -> Filter:
 
 
 def targets() -> Iterator[Target]:
-    """The arguments of all filters."""
+    """Yields the arguments of all filters."""
     names = {"transition": ("F",), "observation": ("H",), "process_noise_cov": ("Q",), "noise_cov": ("R",)}
     matrices = {"transition": TRANSITION, "observation": OBSERVATION}
     covariances = dict.fromkeys(("process_noise_cov", "noise_cov", "cov"), d.covariance(2))

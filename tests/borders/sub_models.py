@@ -24,6 +24,8 @@ from torch_denkf.applications.car.modules.pairs import ClonedPrior, ClonedTransi
 from torch_denkf.applications.car.modules.unicycle_noise import UnicycleNoise
 from torch_denkf.applications.car.modules.unicycle_pose import UnicyclePose
 from torch_denkf.baselines.lstm_cell import LSTMUpdate, with_memory
+from torch_denkf.functional.manifolds import SE2
+from torch_denkf.imperfect import Contaminated, RejectReadings, Visible
 from torch_denkf.modules.keypoints import SpatialSoftArgmax
 from torch_denkf.modules.particles import ParticleAnalysis, ResampledTransition, with_weights
 from torch_denkf.modules.stochastic import FlipoutLinear
@@ -94,7 +96,7 @@ def of(
     also: Mapping[str, tuple[str, ...]] | None = None,
     **given: Any,
 ) -> Subject:
-    """A sub-model; arguments that have no default are those of ``GIVEN``, but for some."""
+    """Returns a sub-model; arguments that have no default are those of ``GIVEN``, except for some."""
     signature = _signature(make)[0] if isinstance(make, type) else inspect.signature(make)
     needed = [name for name, one in signature.parameters.items() if one.default is one.empty and name in GIVEN]
     sound = partial(copy.deepcopy, {**{name: GIVEN[name] for name in needed}, **given})
@@ -175,7 +177,38 @@ def _updates() -> Iterator[Subject]:
     yield of(ParticleAnalysis, on_likelihoods)
 
 
+def _imperfect() -> Iterator[Subject]:
+    masks = {
+        "none": {},
+        "a list": ["observation"],
+        "no key": {"observation": 3},
+        "the reading itself": {"observation": "observation"},
+    }
+    rejecting = {
+        "masks": d.Wrong(masks),
+        "on_bad": d.of("warn"),
+        "by_component": d.of(["y"]),
+        "noises": d.of({"y": "n"}, ["observation"]),
+        "spaces": d.of({"y": SE2()}, {"observation": 3}),
+        "limit": d.POSITIVE,
+        "count_key": d.of(3, "observed"),
+        "limits": d.of(3),
+    }
+    inner, others = m.EnsembleAnalysis("etkf"), (ParticleAnalysis(), m.Select([0]), m.LearnedLikelihood(4, 2))
+    contaminated = {
+        "analysis": d.of(Contaminated(inner), Visible(inner), *others),
+        "share": d.of(-0.1, 1.1, [0.1, 0.2]),
+        "width": d.of(0.0, [2.0, 3.0]),
+        "noise": d.of([0.0], 2.0),
+    }
+    visible = {"analysis": d.of(Visible(inner), *others), "broad": d.of(1.0)}
+    words = ("'observation' twice", "'observed' twice", "space of 'observation'")
+    yield of(RejectReadings, on_row, rejecting, dict.fromkeys(rejecting, words), masks={"observation": "observed"})
+    yield of(Contaminated, not_run, contaminated, {"analysis": ("Contaminated",)}, analysis=inner)
+    yield of(Visible, not_run, visible, {"analysis": ("Visible",)}, analysis=inner)
+
+
 def targets() -> Iterator[Target]:
-    """The arguments of all sub-models."""
-    for subjects in (_motions, _observations, _networks, _updates):
+    """Yields the arguments of all sub-models."""
+    for subjects in (_motions, _observations, _networks, _updates, _imperfect):
         yield from targets_of("sub-models", *subjects())

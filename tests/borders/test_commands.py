@@ -1,11 +1,6 @@
-"""Checks the words and files of commands: the message names the option or the file."""
+"""Arguments and files of commands: the error names the option or the file."""
 
 from torch_denkf.cli.main import main
-
-
-def test_numbers_that_another_option_hides(capsys):
-    assert main(["collect-ur5", "--out", "x", "--no-pixels", "--frames", "-1"]) == 2
-    assert "error: --frames must be a whole number, at least 0; got -1" in capsys.readouterr().err
 
 
 def test_drives_without_a_root(tmp_path, capsys):

@@ -9,12 +9,12 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.common.lorenz96 import lorenz96_step
-from benchmarks.reliability.borders.models import signed
 from benchmarks.reliability.damage import INF, NAN, put
 from benchmarks.reliability.documents import edited
+from tests.borders.models import signed
 from tests.filters.factories import linear_denkf, linear_kalman
 from tests.filters.gaussian_for_tests import linear_filter
-from torch_denkf.applications.car import UnicycleMotion
+from torch_denkf.applications.car import UnicycleMotion, track
 from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter
 from torch_denkf.applications.car.odometry.training import train_car_filter
 from torch_denkf.baselines.lstm_cell import LSTMUpdate
@@ -60,6 +60,7 @@ WRONG = {
     "a class": (lambda: KALMAN(sensor_error=FadingBias), "sensor_error is a FadingBias", "FadingBias"),
     "visibility": (lambda: linear_filter("UKF", visibility=Select([0])), "visibility is a Visibility", "Select"),
     "step": (lambda: lorenz96_step(torch.zeros(4), dt=-0.05), "dt", "got -0.05"),
+    "two clocks": (lambda: list(track(None, [], (1, 1, 1, 1), times=[0.0], fps=10)), "pass times or fps, not both"),
     "pitch": (lambda: evaluate_car_filter(None, "nowhere", ["00"], pitch=NAN), "pitch", "got nan"),
     "no root": (lambda: train_car_filter("out", rendered=3, leave_out=["09"]), "{'leave_out': ['09']}", "--root"),
 }

@@ -131,7 +131,7 @@ def test_warnings_are_one_line(monkeypatch, capsys):
 
 def test_the_process_ends_with_the_status():
     run = subprocess.run(
-        [sys.executable, "-m", "torch_denkf.cli.main", "train", "--out", "x"],
+        [sys.executable, "-m", "torch_denkf", "train", "--out", "x"],
         capture_output=True,
         text=True,
         check=False,

@@ -1,4 +1,4 @@
-"""Recorded steps. No processor records: a stand-in runs what it was asked to record, from the same memory."""
+"""Steps recorded in graphs; on a processor a stand-in reruns the function on the same memory."""
 
 import pickle
 from copy import deepcopy
@@ -13,7 +13,7 @@ from torch_denkf.compilation import CapturedSteps
 
 
 class Rerun:
-    """Stands for a recorder: a replay runs the function once more, on what is in its memory."""
+    """Stands for a CUDA graph: a replay runs the function again on the same memory."""
 
     waiting = ()
     recorded = 0
@@ -50,7 +50,7 @@ def assert_same(ours, theirs, atol=1e-12):
 
 
 def pair(**kwargs):
-    """An eager filter, and the same recorded."""
+    """Returns an eager filter, and the same recorded."""
     eager = toy_denkf("perturbed", **kwargs).double()
     return eager, pickle.loads(pickle.dumps(eager)).compile(mode="graph")
 
@@ -109,7 +109,7 @@ def test_every_filter_recorded_is_eager(float64, reruns, name):
     assert_same(*outs, atol=1e-11)
 
 
-def test_weights_that_an_optimiser_changes_and_weights_that_move_are_read_anew(float64, reruns):
+def test_changed_and_moved_weights_are_read_again(float64, reruns):
     eager, graph = pair()
     frames = noisy_frames(eager, 2, 4)
     for change in (
@@ -169,7 +169,7 @@ def test_running_means_count_each_sequence_once(float64, reruns):
     assert_same(*found)
 
 
-def test_what_waits_for_the_device_runs_eagerly_with_a_warning(float64, reruns, monkeypatch):
+def test_device_synchronisation_runs_eagerly_with_a_warning(float64, reruns, monkeypatch):
     monkeypatch.setattr(reruns, "waiting", ("somewhere.py:7",))
     eager, graph = pair()
     frames = noisy_frames(eager, 2, 3)

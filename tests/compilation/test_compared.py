@@ -22,13 +22,13 @@ needs_compiler = pytest.mark.skipif(not has_compiler(), reason="inductor needs a
 
 
 def kalman(prior=1.0, r=1.0):
-    """Five numbers that walk at random, of which three are read."""
+    """Returns five numbers that walk at random, of which three are read."""
     eye = torch.eye(5)
     return KalmanFilter(eye, eye[:3], process_noise_cov=eye, noise=[r**0.5] * 3, mean=torch.ones(5), cov=prior * eye)
 
 
 def compiler(run):
-    """A backend of torch.compile that runs a graph as ``run(graph, inputs)``, and counts graphs."""
+    """Returns a backend of torch.compile that runs a graph as ``run(graph, inputs)``, and counts graphs."""
 
     def compile_graph(graph, example):
         compile_graph.graphs += 1
@@ -43,14 +43,14 @@ def right(graph, inputs):
 
 
 def half_blind(graph, inputs):
-    """Half of what readings ``[2, ..., 3]`` do is left out: right where they are zero, or hidden."""
+    """Drops half of the effect of readings ``[2, ..., 3]``, which zeros and missing readings do not reveal."""
     without = graph(*(0 * value if value.shape[:1] == (2,) and value.shape[-1] == 3 else value for value in inputs))
     pairs = zip(graph(*inputs), without, strict=True)
     return [(one + other) / 2 if one.is_floating_point() else one for one, other in pairs]
 
 
 def rounded(graph, inputs):
-    """Every input is off by its last digit, as of sums in another order."""
+    """Changes the last digit of every input, as sums in another order do."""
     eps, generator = torch.finfo(torch.float32).eps, torch.Generator().manual_seed(0)
 
     def changed(value):
@@ -64,7 +64,7 @@ def rounded(graph, inputs):
 
 
 def ekf():
-    """Four numbers that stand still, of which two are read."""
+    """Returns four numbers that stand still, of which two are read."""
     return EKF(
         LearnedTransition(torch.nn.Identity(), residual=False),
         None,
@@ -89,7 +89,7 @@ def test_two_of_four_numbers_are_read(options):
     torch.testing.assert_close(mean, expected, rtol=1e-6, atol=1e-7)
 
 
-# -------------------------------------------------------------------------------------------- what is refused
+# -------------------------------------------------------------------------------------------- errors
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_a_wrong_gradient_raises_where_a_sequence_is_trained():
 
 
 def precise():
-    """A reading 1e4 times as precise as the belief, of sums that the belief knows well."""
+    """Returns a reading 1e4 times as precise as the belief, of sums that the belief knows well."""
     sums = torch.tensor([[1.0, 1.0, 1.0]])
     cov = 1e4 * torch.ones(3, 3) + torch.diag(torch.tensor([1.0, 2.0, 3.0]))
     filter = KalmanFilter(
@@ -168,7 +168,7 @@ def precise():
 
 
 def many_particles():
-    """One of so many falls on the other side of a border, and another particle is in its place."""
+    """Moves one particle across a resampling border, so that another takes its place."""
     filter = particles("systematic")
     filter.initial.module = GaussianPrior([0.5, -0.25], [1.0, 1.0], ensemble_size=3000)
     row = filter.initialise(TensorDict({"observation": torch.randn(60, 2)}, [60]))
@@ -188,7 +188,7 @@ def test_rounding_is_measured(make, monkeypatch):
         assert filter.step(row.copy())["belief", "mean"].isfinite().all()
 
 
-def test_nothing_is_compiled_twice_for_it_and_it_is_done_once(monkeypatch):
+def test_comparison_runs_once_without_recompilation(monkeypatch):
     """Frames that are zero, expanded, or laid out otherwise: what takes their place is laid out so, too."""
     filter, counting = kalman(), compiler(right)
     filter.compile(backend=counting)
@@ -203,7 +203,7 @@ def test_nothing_is_compiled_twice_for_it_and_it_is_done_once(monkeypatch):
     assert counting.graphs == 1
 
 
-def test_it_draws_no_number_of_the_users():
+def test_comparison_leaves_the_random_state():
     filter, states = toy_denkf(), []
     row = filter.initialise(toy_frames((2,), masks=0, resets=False))
     for chunk in (0, 1):
@@ -216,7 +216,7 @@ def test_it_draws_no_number_of_the_users():
 NAMES = {"names": ["x"], "outputs": ["y"], "frames": [], "what": "thing", "cure": ""}
 
 
-def test_what_has_no_value_in_both_is_equal_and_in_one_is_not():
+def test_nan_in_both_is_equal_and_in_one_is_not():
     nan = torch.tensor([1.0, torch.nan, torch.inf])
     check_same_numbers(lambda x: 1 * x, lambda x: x, (nan,), **NAMES)
     with pytest.raises(RuntimeError, match="'y' is up to inf off"):

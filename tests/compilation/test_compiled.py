@@ -66,7 +66,7 @@ def test_inductor_gives_the_eager_sequence_and_gradients_for_a_seed(dtype):
 
 
 @pytest.mark.skipif(not has_compiler(), reason="a compiler is asked for, and dynamo alone is in its place")
-def test_what_changes_after_compiling_is_noticed(monkeypatch):
+def test_changes_after_compilation_take_effect(monkeypatch):
     """Leaves out some of what torch.compile checks before a call, and not that."""
     compile = torch.compile
 
@@ -128,7 +128,7 @@ def test_a_new_filter_of_other_modules_or_options_compiles_its_own(float64):
         assert other.compiled is not compiled.compiled
 
 
-def test_a_policys_data_go_on_from_what_is_stored(float64):
+def test_policy_data_resume_from_stored_beliefs(float64):
     """Slices that begin in the middle, an episode that begins inside of one, and a first belief that is all zero."""
     filter = linear_kalman()
     data = TensorDict({"observation": torch.randn(2, 3, 2), "is_init": torch.zeros(2, 3, 1, dtype=torch.bool)}, [2, 3])
@@ -158,7 +158,7 @@ def test_a_stochastic_analysis_of_a_users_own_is_the_librarys(float64):
     torch.testing.assert_close(*outs, rtol=0, atol=1e-12)
 
 
-def test_a_compiled_step_draws_its_noise_outside_and_anew():
+def test_compiled_step_draws_new_noise_outside():
     filter, means = linear_denkf("perturbed", noisy=True).compile(chunk=1, backend="eager"), []
     td = filter.initialise(TensorDict({"observation": torch.randn(2, 2)}, [2]))
     for seed in (1, 1, 2):

@@ -95,14 +95,14 @@ def test_in_time_is_for_constant_matrices():
         linear_system().compile(mode="in time", dynamic=True)
 
 
-def test_in_time_says_of_a_reading_what_a_step_says():
+def test_in_time_names_readings_of_another_dtype():
     for strategy in ({"chunk": 0}, {"mode": "in time"}):
         with pytest.raises(TypeError, match=r"got .*'observation' in torch.float64. Convert the data"):
             linear_system().compile(**strategy).sequence(TensorDict({"observation": torch.zeros(3, 2).double()}, [3]))
 
 
 @pytest.mark.parametrize("kind", ["transition", "wrapper", "analysis"])
-def test_in_time_takes_no_module_that_changes_what_the_matrices_say(kind):
+def test_in_time_rejects_modules_that_change_the_matrices(kind):
     filter = linear_system()
 
     class Drift(LinearTransition):

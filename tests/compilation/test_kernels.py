@@ -10,7 +10,7 @@ aten = torch.ops.aten
 
 
 def changed(function, *args):
-    """The function as a graph of aten calls, after the passes; and what is called in it."""
+    """Returns the function as a graph of aten calls, after the passes; and what is called in it."""
     module = make_fx(function, tracing_mode="fake")(*args)
     FewCalls()(module.graph)
     module.graph.lint()

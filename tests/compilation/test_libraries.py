@@ -1,4 +1,4 @@
-"""Half a library in inductor's cache: removed, said, and compiled again; whole ones and those being written stay."""
+"""Truncated libraries in inductor's cache are removed with a message and compiled again; others are kept."""
 
 import contextlib
 import io
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def cache(tmp_path):
-    """A real library, the smallest of torch's, and its beginnings."""
+    """Returns the smallest library of torch, and truncated copies of it."""
     source = min(Path(torch.__file__).parent.glob("lib/*.so"), key=os.path.getsize)
     (tmp_path / "ab").mkdir()
     shutil.copy(source, tmp_path / "ab" / "cabwhole.so")
@@ -40,7 +40,7 @@ def cache(tmp_path):
     return tmp_path
 
 
-def test_half_libraries_go_and_whole_ones_stay(cache, caplog):
+def test_truncated_libraries_are_removed_and_whole_ones_kept(cache, caplog):
     assert is_whole(cache / "ab" / "cabwhole.so")
     with caplog.at_level(logging.WARNING, "torch_denkf"), locked(cache / "locks", "cabhead.lock", "compiles"):
         removed = clear_damaged_libraries(cache)
@@ -82,7 +82,7 @@ needs_compiler = pytest.mark.skipif(not has_compiler(), reason="torch.compile ne
 @needs_compiler
 @pytest.mark.slow
 def test_a_compilation_that_was_killed_is_done_again():
-    """A library of the tests' own cache, cut as a killed linker leaves it."""
+    """A truncated library, as a killed linker leaves it, is compiled again."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
         exec(STEP, {})
@@ -90,7 +90,7 @@ def test_a_compilation_that_was_killed_is_done_again():
     assert json.loads(mean) == pytest.approx([2 / 3] * 5)
     library = Path(libraries.split()[0])
     assert library.is_relative_to(COMPILED)
-    library.unlink()  # who has it loaded keeps it
+    library.unlink()  # a process that has loaded it keeps it
     library.write_bytes(b"\x7fELF" + bytes(30))
     done = subprocess.run([sys.executable, "-c", STEP], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[0] == mean

@@ -13,7 +13,7 @@ from torch_denkf.compilation.partition import FewSavedTensors
 
 
 def compiled(function, partitioner=None):
-    """The function through all that inductor does before it writes code, which alone needs a C++ compiler."""
+    """Returns the function through all that inductor does before it writes code, which alone needs a C++ compiler."""
     torch._dynamo.reset()
 
     def split(*args, **fields):
@@ -35,7 +35,7 @@ def steps(x: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
 
 
 def run(function, shape, dtype):
-    """Gradients of weights and input, and the shapes of all that was saved for them."""
+    """Returns gradients of weights and input, and the shapes of all that was saved for them."""
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(shape, generator=generator, dtype=dtype).requires_grad_()
     w = (0.3 * torch.randn(shape[-1], shape[-1], generator=generator, dtype=dtype)).requires_grad_()
@@ -67,7 +67,7 @@ def test_small_tensors_go_as_one_and_gradients_stay(dtype):
 
 
 def layers(x: torch.Tensor, first, bias, second, third) -> tuple[torch.Tensor, torch.Tensor]:
-    """Five steps through a layer with bias and a second one; a third sees what the first one does."""
+    """Returns five steps through a layer with bias and a second one; a third sees what the first one does."""
     outputs = []
     for _ in range(5):
         hidden = torch.nn.functional.linear(x, first, bias).relu()
@@ -77,7 +77,7 @@ def layers(x: torch.Tensor, first, bias, second, third) -> tuple[torch.Tensor, t
 
 
 def run_layers(function, rows):
-    """Gradients of the input, the weights and the bias."""
+    """Returns gradients of the input, the weights and the bias."""
     generator = torch.Generator().manual_seed(0)
     shapes = ((2, rows, 4), (4, 4), (4,), (4, 4), (4, 4))
     args = [torch.randn(shape, generator=generator, dtype=torch.float64).mul(0.3).requires_grad_() for shape in shapes]

@@ -22,7 +22,7 @@ def steps(x, layers, count):
 
 
 def compiled(count, *arguments):
-    """The result of a number of compiled steps, and how many functions of C++ they need."""
+    """Returns the result of a number of compiled steps, and how many functions of C++ they need."""
     torch._dynamo.reset()
     function = torch.compile(lambda *args: steps(*args, count), options=options_for_processors(), fullgraph=True)
     with torch.no_grad():

@@ -29,7 +29,7 @@ def chain(float64):
 
 
 def alone(chain, x):
-    """The gradients without sharing."""
+    """Returns the gradients without sharing."""
     out = x
     for _ in range(4):
         out = chain.layers(out)

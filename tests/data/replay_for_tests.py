@@ -6,7 +6,7 @@ from torchrl.data import SliceSampler, SliceSamplerWithoutReplacement
 
 
 def ways_to_slice():
-    """Options that each ask for slices of 6 rows; new samplers each time, since they remember where episodes end."""
+    """Returns options for slices of 6 rows, each with a new sampler, because samplers cache the episodes' ends."""
     return [
         {"num_slices": 4},
         {"slice_len": 6},

@@ -1,4 +1,4 @@
-"""Cache entries: what is opened is what was written, or it is made anew; nothing in them is executed."""
+"""Cache entries: what is opened is what was written, or it is made again; nothing in them is executed."""
 
 import json
 import logging
@@ -81,7 +81,7 @@ def test_writing_to_an_opened_entry_changes_no_file(entry):
     check_entry(entry)
 
 
-def test_workers_get_what_was_written_to_the_file(entry):
+def test_workers_read_the_written_file(entry):
     opened = cached(entry, never)
     opened["pixels"][0] = 7
     with get_context("fork").Pool(1) as pool:
@@ -135,7 +135,7 @@ def truncate(file, *sizes):
 
 
 def replace_by(make):
-    """Puts something else in the place of a file."""
+    """Replaces a file by something else."""
 
     def replace(file):
         file.unlink()
@@ -145,7 +145,7 @@ def replace_by(make):
 
 
 def lists(batch_sizes, tensors):
-    """A manifest with its checksum, of other tensors."""
+    """Returns a manifest with its checksum, of other tensors."""
 
     def write(file):
         text = json.dumps({"format": "torch_denkf.cache/1", "batch_sizes": batch_sizes, "tensors": tensors})
@@ -176,7 +176,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_a_damaged_entry_is_made_anew_with_one_line(entry, how, caplog):
+def test_damaged_entry_is_rebuilt_with_one_message(entry, how, caplog):
     name, damage = WAYS[how]
     damage(entry / name)
     assert is_entry(entry) == (how not in ("no manifest", "a pipe for a manifest"))
@@ -207,7 +207,7 @@ def test_every_byte_counts_for_the_whole_check(entry, capsys):
     assert Cache.main(["check", *words]) == 0
 
 
-def test_nothing_that_was_planted_is_executed(entry, tmp_path):
+def test_planted_code_is_not_executed(entry, tmp_path):
     """tensordict's own format may hold pickles; an entry of the cache that holds one is none."""
 
     class Trap:
@@ -277,7 +277,7 @@ def test_the_next_start_sweeps(tmp_path):
 
 
 def test_a_sound_entry_of_another_process_is_not_taken_for_damaged(entry, monkeypatch):
-    """Found damaged, but replaced by a sound one before it could be removed."""
+    """A damaged entry is replaced by a valid one before it is removed."""
     from torch_denkf.data import cache
 
     calls = []

@@ -20,7 +20,7 @@ ROWS = 12
 
 
 def make(count=10, *, for_tests=lambda episode: False, lengths=None, **options):
-    """Episodes whose numbers tell where they are: state (episode, step), action (100 episode + step)."""
+    """Returns episodes whose numbers tell where they are: state (episode, step), action (100 episode + step)."""
     lengths = lengths or [ROWS] * count
     step = torch.cat([torch.arange(length) for length in lengths]).unsqueeze(-1)
     number = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths)).unsqueeze(-1)
@@ -70,7 +70,7 @@ def test_rollouts_are_episodes_with_statistics_of_all_that_was_seen():
 
 
 @pytest.mark.parametrize("ends", [False, True])
-def test_what_pads_a_rollout_is_no_row(ends):
+def test_padding_of_a_rollout_is_no_row(ends):
     """torchrl's split_trajectories pads the shorter ones with zeros, and marks that."""
     done = torch.zeros(2, ROWS, 1, dtype=torch.bool)
     done[0, 2] = ends
@@ -114,7 +114,7 @@ def test_slices_that_may_be_shorter_stay_flat():
     for _ in range(20):
         sample = data.sample()
         assert sample.batch_dims == 1
-        # Each begins where it is marked, and goes on by one step.
+        # Each begins where it is marked, and continues by one step.
         begins = sample["is_init"].squeeze(-1)
         assert begins[0]
         assert (sample["step"].diff(dim=0).squeeze(-1)[~begins[1:]] == 1).all()
@@ -135,7 +135,7 @@ def names(**options):
     return {episode.name for episode in make(**options).episodes}
 
 
-def test_validation_is_cut_out_of_training_only_where_it_is_asked_for():
+def test_validation_split_is_optional():
     def for_tests(episode):
         return hashed_share(episode.name, "test") < 0.25
 
@@ -235,10 +235,10 @@ def test_episodes_that_do_not_fit_their_rows():
         Episode("a", 0, 3),
         Episode("b", 4, 2),
     )
-    fails(ValueError, "each of at least a row", rows, Episode("a", 0, 0), Episode("b", 0, 6))
+    fails(ValueError, "each of at least one row", rows, Episode("a", 0, 0), Episode("b", 0, 6))
 
 
-def test_losses_take_a_sample_as_it_is():
+def test_losses_accept_samples():
     pictures = torch.randint(256, (60, 3, 24, 24), dtype=torch.uint8)
     rows = TensorDict({"observation": {"image": pictures, "state": torch.rand(60, 2)}}, [60])
     rows["episode"] = torch.arange(5).repeat_interleave(12)

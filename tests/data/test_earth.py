@@ -24,6 +24,6 @@ def test_places_in_metres_and_back(place, origin, metres):
     np.testing.assert_allclose(to_degrees(flat, origin[:2]), [place[:2]] * 2, rtol=0, atol=1e-10)
 
 
-def test_what_is_no_place():
+def test_invalid_places():
     with pytest.raises(ValueError, match=r"latitude, longitude and perhaps a height, \[\*, 2 or 3\]; got \[4\]"):
         to_local(np.zeros(4), [0.0, 0.0])

@@ -1,7 +1,7 @@
 """A packaged step gives the eager step's numbers where there is more to trace than plain arithmetic.
 
 Jacobians by automatic differentiation, a Gauss-Newton search, an LSTM cell: traced wrongly, each gives a package that
-runs without a word, and is wrong.
+runs silently, and is wrong.
 """
 
 import pytest
@@ -13,20 +13,13 @@ from tests.filters.gaussian_for_tests import learned_filter, learned_frames
 from torch_denkf.baselines import IEnKS, LSTMFilter
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.filters import EKF
-from torch_denkf.modules import (
-    ConstantNoise,
-    GaussianPrior,
-    LearnedTransition,
-    MomentPrior,
-    Select,
-    StochasticMLP,
-)
+from torch_denkf.modules import ConstantNoise, GaussianPrior, LearnedTransition, MomentPrior, Select, StochasticMLP
 
 STATES = 3
 
 
 def bend(states):
-    """A known motion that is not linear."""
+    """Returns a known motion that is not linear."""
     x, y, z = states.unbind(-1)
     return torch.stack([x + 0.3 * y.sin(), 0.9 * y - 0.1 * x**3, z.cos() * x], -1)
 

@@ -68,7 +68,7 @@ def test_many_steps_equal_the_filters(package):
         torch.testing.assert_close(packaged["info.nis"], eager["info", "nis"], rtol=1e-3, atol=1e-4)
 
 
-def test_it_loads_and_runs_where_neither_tensordict_nor_torchrl_is_imported(package):
+def test_package_runs_without_tensordict_and_torchrl(package):
     _, _, path = package
     code = f"""
 import sys, torch
@@ -104,18 +104,14 @@ def test_noise_drawn_inside_follows_the_seed_and_differs_from_step_to_step(tmp_p
     assert not first[0].equal(other[0])
 
 
-def exported(folder, name="step.pt2", lacks=(), **options):
-    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)}).exclude(*lacks)
+def exported(folder, name="step.pt2", **options):
+    example = TensorDict({"state": torch.zeros(3), "reading": torch.zeros(2)})
     return export_step(small_filter(), example, folder / name, **options)
 
 
-def loaded(name, content=None):
-    def load(folder):
-        if content is not None:
-            (folder / name).write_bytes(content)
-        return load_step(folder / name)
-
-    return load
+def no_model(folder):
+    (folder / "a.onnx").write_bytes(b"no model")
+    return load_step(folder / "a.onnx")
 
 
 def others_program(folder):
@@ -123,26 +119,11 @@ def others_program(folder):
     return load_step(folder / "other.pt2")
 
 
-def wrong_entry(folder):
-    step = load_step(exported(folder, compiled=False))
-    return step({**{name: torch.zeros(shape) for name, (shape, _) in step.inputs.items()}, "reading": torch.zeros(3)})
-
-
 ERRORS = {
-    "another suffix": (partial(exported, name="step.pt"), ValueError, r"ends in \.pt2"),
     "another format": (partial(exported, format="tflite"), ValueError, 'format is "pt2" or "onnx"'),
     "a suffix of another format": (partial(exported, format="onnx"), ValueError, r"ends in \.onnx"),
-    "no such output": (partial(exported, out_keys=["nothing"], compiled=False), ValueError, "does not write"),
-    "no reading": (partial(exported, lacks=["reading"], compiled=False), KeyError, "the example lacks"),
-    "no file": (loaded("none.pt2"), FileNotFoundError, "export_step"),
-    "a cut file": (loaded("cut.pt2", b"PK"), ValueError, "was cut"),
-    "a file that is no model": (
-        loaded("a.onnx", b"no model"),
-        ValueError,
-        r"a\.onnx is no ONNX model, or it is damaged",
-    ),
+    "a file that is no model": (no_model, ValueError, r"a\.onnx is no ONNX model, or it is damaged"),
     "another program": (others_program, ValueError, "not one of export_step"),
-    "another shape": (wrong_entry, ValueError, r"'reading' must be torch.float32 \[2\], got torch.float32 \[3\]"),
 }
 
 
@@ -157,7 +138,7 @@ def test_errors(call, error, match, tmp_path):
 def test_packages_that_are_not_installed_are_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ImportError, match=r"torch_denkf\[onnx\]"):
-        loaded("a.onnx", b"no model")(tmp_path)
+        no_model(tmp_path)
     monkeypatch.setattr(onnx_model, "find_spec", lambda name: None if name == "onnxscript" else 1)
     with pytest.raises(ImportError, match=r"onnxscript.*torch_denkf\[onnx\]"):
         exported(tmp_path, "step.onnx", format="onnx")

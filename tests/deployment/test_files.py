@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def start(code, *arguments):
-    """A process that says when it holds what it holds."""
+    """Returns a process that says when it holds what it holds."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "ready\n"
@@ -42,7 +42,7 @@ with locked(Path(sys.argv[1]), ".lock", "is writing to it"):
 """
 
 
-def test_a_failure_leaves_what_was_there(tmp_path):
+def test_failure_keeps_the_old_file(tmp_path):
     file = tmp_path / "new" / "table.csv"
     write_text(file, "earlier")
     for error in (ValueError, KeyboardInterrupt, OSError):
@@ -68,7 +68,7 @@ def _mask():
     return mask
 
 
-def test_what_a_killed_writer_left_goes_and_what_a_living_one_writes_stays(tmp_path):
+def test_leftovers_of_killed_writers_are_removed(tmp_path):
     file = tmp_path / "result.json"
     write_text(file, "earlier")
     alive, killed = start(WRITES, file), start(WRITES, file)

@@ -38,27 +38,6 @@ def test_two_savers_at_a_time(tmp_path):
         save(tmp_path, 2)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda config: config["settings"].update(size=3),
-        lambda config: config["training"].update(seed=1),
-        lambda config: config["versions"].update(torch="1.0"),
-        lambda config: config.update(note="better"),
-        lambda config: config.pop("versions"),
-        lambda config: config.pop("checksum"),
-        lambda config: config.update(checksum=3),
-    ],
-)
-def test_a_description_that_was_changed_is_told_of(tmp_path, change):
-    save(tmp_path, 2)
-    config = json.loads((tmp_path / "config.json").read_text())
-    change(config)
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ValueError, match=r"config\.json is damaged, or was changed by hand"):
-        load_folder(tmp_path, {"line": line})
-
-
 def test_white_space_of_a_description_does_not_count(tmp_path):
     save(tmp_path, 2)
     file = tmp_path / "config.json"

@@ -20,7 +20,7 @@ pytest.importorskip("onnxruntime")
 
 
 def one_number(**options):
-    """A number that walks at random with variance 1, read with variance 1."""
+    """Returns a number that walks at random with variance 1, read with variance 1."""
     one = torch.eye(1)
     return KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one, **options)
 
@@ -97,7 +97,7 @@ assert "torch" not in sys.modules
     np.testing.assert_allclose(found, [[2 / 3, 2 / 3], [2 / 3, 5 / 3], [2 / 3, 8 / 3]], rtol=1e-6)
 
 
-def test_what_onnx_lacks_is_named(tmp_path):
+def test_operators_missing_in_onnx_are_named(tmp_path):
     path, frame = tmp_path / "step.onnx", TensorDict({"reading": torch.zeros(2)})
     etkf = DEnKF(**parts(bend), analysis=EnsembleAnalysis("etkf", observation_key="reading"), initial=members())
     with pytest.raises(RuntimeError, match=r'aten\._linalg_eigh.* choose "perturbed".*format="pt2"'):

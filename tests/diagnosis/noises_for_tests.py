@@ -55,7 +55,7 @@ class Made(Sensor):
 
 
 def filter_of(name, r, q):
-    """A filter of the linear system with the noise modules ``r`` and ``q``."""
+    """Returns a filter of the linear system with the noise modules ``r`` and ``q``."""
     F, _, H, _ = linear_system()
     moments = MomentPrior(torch.zeros(2), torch.eye(2))
     members = GaussianPrior(torch.zeros(2), torch.ones(2), ensemble_size=8)
@@ -82,7 +82,7 @@ def filter_of(name, r, q):
 
 
 def sound_frames():
-    """Readings ``[B, T]``, and variances for R and Q."""
+    """Returns readings ``[B, T]``, and variances for R and Q."""
     frames = TensorDict({"observation": 0.1 * torch.ones(B, T, 2), "observed": torch.ones(B, T, 1).bool()}, [B, T])
     frames["is_init"] = torch.zeros(B, T, 1, dtype=torch.bool)
     frames["is_init"][:, 0] = True
@@ -100,7 +100,7 @@ def run(filter, frames, way):
 
 
 def attitude(kind):
-    """A filter of an attitude, whose steps differ in length, and a row for it."""
+    """Returns a filter of an attitude, whose steps differ in length, and a row for it."""
     motion, r = AttitudeMotion("dt", gyro_noise=0.1, gyro_walk=0.01), ConstantNoise([0.1] * 3, in_key="y")
     space = motion.space
     if kind == "EKF":

@@ -30,7 +30,7 @@ def walk_filter(process_noise, members=32, **options):
 
 
 def walks(moving=(1.0, 1.0), steps=STEPS):
-    """Readings of walks, some of which stand still."""
+    """Returns readings of random walks, some of which are constant."""
     torch.manual_seed(0)
     state = (STEP * torch.tensor(moving) * torch.randn(2, steps, 2)).cumsum(1)
     return TensorDict({"reading": state + NOISE * torch.randn_like(state)}, [2, steps])
@@ -44,27 +44,27 @@ def said(filter, data, **options):
     return [str(each.message) for each in caught if "too narrow" in str(each.message)]
 
 
-def test_filter_whose_noise_is_right_says_nothing():
+def test_consistent_filter_does_not_warn():
     assert not said(walk_filter([STEP, STEP]), walks())
 
 
 @pytest.mark.parametrize("component", [0, 1])
-def test_names_the_reading_and_the_component_that_is_held_too_firmly(component):
+def test_warning_names_reading_and_narrow_component(component):
     noise = [STEP, STEP]
     noise[component] = 1e-3
     (text,) = said(random_draws(walk_filter(noise)), walks())
     assert "'reading' at place 'analysis'" in text
-    assert f"Number {component} tells most of component {component} of the state" in text
+    assert f"Component {component} correlates most with state component {component}" in text
     assert 'localisation="significance"' in text
 
 
 @pytest.mark.parametrize("members", [32, 256])
-def test_outliers_are_named_as_a_cause_and_few_members_where_they_are_few(members):
+def test_warning_names_outliers_and_few_members(members):
     """A jump that the motion holds for impossible: 256 members are as far off, and gating is the cure."""
     data = TensorDict({"reading": torch.zeros(1, STEPS, 2)}, [1, STEPS])
     data["reading"][:, 5:] = 1e3
     (text,) = said(walk_filter([1e-3, 1e-3], members), data)
-    assert "An outlier, or a jump, may have taken the belief away: put a gate around the filter, Gated(filter)" in text
+    assert "Outliers, or a jump, may have displaced the belief: put a gate around the filter, Gated(filter)" in text
     assert ("few members" in text) == (members == 32)
     gated = Gated(walk_filter([1e-3, 1e-3], members), 2, patience=10)
     assert (gated.sequence(data)["belief", "mean"][0, -1] - 1e3).abs().max() < 1.0
@@ -104,7 +104,7 @@ def test_hidden_readings_do_not_count():
     assert said(walk_filter([1e-3, 1e-3]), data)
 
 
-def test_nothing_is_looked_at_in_training_or_where_diagnostics_are_not_kept():
+def test_no_check_in_training_or_without_diagnostics():
     assert not said(walk_filter([1e-3, 1e-3]), walks(), keep=[("belief", "mean")])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,4 +1,4 @@
-"""Oracle: truths drawn from the beliefs themselves, about their means, in the axes of the space."""
+"""Oracle: true states drawn from the belief's own distribution, in the tangent space at its mean."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from torch_denkf.metrics import interval_coverage, nees, state_errors
 
 N, NAN = 3000, float("nan")
 SPACE = Product(SE2(), Euclidean(1))
-STD = torch.tensor([0.2, 2.0, 0.1, 1.0], dtype=torch.float64)  # of the heading, ahead, to the left, of a number
+STD = torch.tensor([0.2, 2.0, 0.1, 1.0], dtype=torch.float64)  # heading, forward, left, and the scalar component
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +20,7 @@ def _double(float64):
 
 
 def beliefs(kind, space=SPACE, std=STD, size=16, n=N):
-    """Means all around, and truths that are distributed as the belief says; all elements but the first count."""
+    """Returns beliefs with random means, and true states drawn from them; the first element is not scored."""
     rng = torch.Generator().manual_seed(0)
     mean = space.exp(3 * torch.randn(1, n + 1, space.tangent_dim, generator=rng))
 
@@ -43,21 +43,21 @@ def beliefs(kind, space=SPACE, std=STD, size=16, n=N):
 
 @pytest.mark.parametrize("kind", ["EKF", "etkf", "particles"])
 @pytest.mark.parametrize("space", [SPACE, SO3()])
-def test_a_belief_that_knows_its_error(kind, space):
-    std = torch.linspace(0.1, 0.2, space.tangent_dim)  # narrow: the mean of members turns their axes
+def test_scores_of_a_consistent_belief(kind, space):
+    std = torch.linspace(0.1, 0.2, space.tangent_dim)  # narrow: the tangent axes turn with the mean of the members
     size, n = (200, 500) if kind == "particles" else (16, N)
     out = evaluate(make(kind, space), beliefs(kind, space, std, size, n), level=0.8)
     assert out.known.tolist() == [n] * space.tangent_dim
     assert (out.coverage - 0.8).abs().max() < 5 * (0.16 / n) ** 0.5
-    own = 1.0 if kind == "EKF" else 1 + 1 / size  # the mean of members is off by its own share
+    own = 1.0 if kind == "EKF" else 1 + 1 / size  # the sample mean adds a variance of 1 / size
     torch.testing.assert_close(out.rmse, std * own**0.5, rtol=5 / n**0.5, atol=0)
-    torch.testing.assert_close(out.crps, std / torch.pi**0.5, rtol=0.1, atol=0)  # of a Gaussian: sigma over root pi
-    dim = space.tangent_dim  # the inverse of a sample's covariance is too large where members were drawn at random
+    torch.testing.assert_close(out.crps, std / torch.pi**0.5, rtol=0.1, atol=0)  # Gaussian: sigma / sqrt(pi)
+    dim = space.tangent_dim  # the inverse of a sample covariance of random members is biased upwards
     expected = dim if kind != "etkf" else dim * (size + 1) * (size - 1) / (size * (size - dim - 2))
     assert abs(out.nees.mean / expected - 1) < 0.1
 
 
-def test_a_pose_has_the_axes_of_the_body():
+def test_coverage_of_a_pose_is_in_body_axes():
     data = beliefs("EKF")
     mean, var, cov, truth = (
         data[key][0] for key in (("belief", "mean"), ("belief", "var"), ("belief", "cov"), "state")
@@ -74,7 +74,7 @@ def test_a_pose_has_the_axes_of_the_body():
     torch.testing.assert_close(out.rmse, state_errors(mean[1:], truth[1:], space=SPACE).rmse)
 
 
-def test_truths_that_are_known_in_part():
+def test_partially_known_true_state():
     data = beliefs("EKF")
     filter, whole = make("EKF", SPACE), evaluate(make("EKF", SPACE), data)
     pose = evaluate(filter, data, data["state"][..., :3])
@@ -91,7 +91,7 @@ def test_truths_that_are_known_in_part():
     assert part.nees.values.shape == (99,)
 
 
-def test_frames_are_filtered_first_and_smoothed_beliefs_are_scored_by_their_name():
+def test_frames_without_a_belief_are_filtered_and_smoothed_beliefs_are_scored():
     filter, space = make("EKF", SE2()), SE2()
     rng = torch.Generator().manual_seed(3)
     truth = space.exp(0.3 * torch.randn(4, 1, 3, generator=rng)).expand(4, 8, 3)

@@ -80,7 +80,7 @@ def test_no_false_alarm_where_the_mask_is_read(make):
 
 @pytest.mark.parametrize("observed", [None, True])
 @pytest.mark.parametrize("make", [linear_denkf, linear_kalman, lambda: bootstrap(20)])
-def test_a_held_reading_that_counts_anew_is_said_once(make, observed):
+def test_forward_filled_reading_used_again_warns_once(make, observed):
     filter, frames = make(), readings(2, 4).set("observation_observed", hidden(2, 4))
     if observed:  # the mask of another sensor
         frames["observed"] = torch.ones(2, 4, 1, dtype=torch.bool)
@@ -93,7 +93,7 @@ def test_a_held_reading_that_counts_anew_is_said_once(make, observed):
 
 
 @pytest.mark.parametrize("case", ["its key", "hidden, too", "all new"])
-def test_no_false_alarm_where_held_readings_are_hidden(case):
+def test_no_warning_if_forward_filled_readings_are_masked(case):
     filter, frames = linear_kalman(), readings(2, 4).set("observation_observed", hidden(2, 4))
     if case == "its key":
         filter = linear_kalman(observed_key="observation_observed")

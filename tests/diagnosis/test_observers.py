@@ -83,7 +83,7 @@ def test_a_run_is_seen_once(make, chunk, way):
 
 
 @pytest.mark.parametrize("way", ["step", "sequence", "policy"])
-def test_an_observer_that_raises_leaves_the_tensordict_as_it_was(way):
+def test_raising_observer_leaves_the_tensordict_unchanged(way):
     filter, seen = linear_kalman(), Seen()
     filter.observers, seen.raises = [seen], True
     td = frames(2, 5) if way == "sequence" else filter.initialise(frames(2))

@@ -14,7 +14,7 @@ from tests.filters.factories import linear_kalman
 from torch_denkf.transforms import DEnKFTransform
 
 
-def test_a_filter_in_environment_and_policy_counts_readings_twice_and_says_so():
+def test_filter_in_environment_and_policy_warns_of_double_use():
     filter = linear_kalman()
     env = environment(DEnKFTransform(filter))
     with warnings.catch_warnings(record=True) as record:

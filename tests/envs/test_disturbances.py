@@ -32,7 +32,7 @@ class Striped(Changed):
 
 
 def pictures_env(dtype=torch.uint8, batch=()):
-    """Rows end after three steps and after four."""
+    """Ends rows after three and after four steps."""
     return TransformedEnv(base_env(batch_size=batch, max_steps=[3, 4] if batch else 3), Striped(dtype))
 
 
@@ -126,7 +126,7 @@ def test_random_boxes_are_whole_and_everywhere():
     assert ((counts - 500).abs() < 5 * (6000 / 12 * 11 / 12) ** 0.5).all()
 
 
-def test_black_frames_say_nothing():
+def test_black_frames_are_not_masked():
     image = pictures(20_000, size=(1, 1, 2))
     out = BlackFrames(0.3, generator=rng())(
         TensorDict({"pixels": image, "observed": torch.ones(20_000, 1).bool()}, [20_000])
@@ -138,7 +138,7 @@ def test_black_frames_say_nothing():
 
 
 @pytest.mark.parametrize("kind", ALL)
-def test_what_holds_for_all(kind):
+def test_common_properties(kind):
     image = pictures(2, 3, size=(3, 10, 30))
     before = image.clone()
     td = TensorDict({"pixels": image}, [2])
@@ -191,7 +191,7 @@ def test_in_an_environment(kind, dtype, batch):
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 @pytest.mark.parametrize("fill", ["blur", "noise"])
-def test_what_is_seen_in_the_place_of_a_box(dtype, fill):
+def test_image_behind_an_occluding_box(dtype, fill):
     """Blur is OpenCV's box filter; noise is uniform between black and white; around the box nothing changes."""
     image, white = pictures(2, size=(3, 32, 32)), 255 if dtype == torch.uint8 else 1.0
     image = image if dtype == torch.uint8 else image.float() / 255

@@ -29,7 +29,7 @@ def by_hand(data):
 
 
 def test_episodes_that_end_apart():
-    """Rows of 3, 5 and 4 steps: each begins anew, and the others keep what they hold."""
+    """Rows of 3, 5 and 4 steps: each is reset, and the others keep what they hold."""
     env = held_env(batch_size=[3], max_steps=[3, 5, 4])
     data = env.rollout(60, break_when_any_done=False)
     assert (data["step"] == 0).sum((1, 2)).tolist() == [20, 12, 15]
@@ -40,7 +40,7 @@ def test_episodes_that_end_apart():
     assert data["held"][began].eq(0).all()
 
 
-def test_a_reset_forgets_what_was_held():
+def test_reset_clears_the_held_reading():
     for reading, seen, held in ((NAN, False, 0.0), (5.0, True, 5.0)):
         frame = TensorDict({"observation": torch.tensor([reading]), "observed": torch.tensor([seen])})
         assert HoldReading()._reset(TensorDict({"held": torch.tensor([2.0])}), frame)["held"].item() == held

@@ -22,7 +22,7 @@ def test_rate_mask_and_zeros(p):
 
 
 @pytest.mark.parametrize("width", [1, 2])
-def test_what_is_missing_already_stays_missing(width):
+def test_missing_readings_stay_missing(width):
     before = torch.rand(5000, width) < 0.5
     td = TensorDict({"gps": torch.ones(5000, 2), "observed": before}, [5000])
     out = MissingFrames(0.3, in_keys=["gps"])(td.clone())

@@ -38,7 +38,7 @@ def test_readings_are_noisy_and_missing():
     assert bool(rollout["observation"][~rollout["observed"].squeeze(-1)].isnan().all())
 
 
-def test_a_torque_that_is_too_large_is_held():
+def test_torque_is_clamped():
     env = NoisyPendulumEnv(batch_size=[4])
     start = env.reset()
     large, most = (env.step(start.clone().set("action", torch.full((4, 1), u)))["next"] for u in (9.0, 2.0))

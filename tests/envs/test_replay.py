@@ -21,7 +21,7 @@ LENGTHS = [6, 9, 4, 7]
 
 
 def make(actions=True, transform=None):
-    """State (episode, step), a reading of its own, and an action that tells both."""
+    """Returns the state (episode, step), a reading of its own, and an action that tells both."""
     step = torch.cat([torch.arange(length) for length in LENGTHS]).unsqueeze(-1)
     number = torch.arange(4).repeat_interleave(torch.tensor(LENGTHS)).unsqueeze(-1)
     rows = {"step": step, "time": 0.1 * step.double(), "state": torch.cat([number, step], -1).float()}
@@ -63,7 +63,7 @@ def same(shown, data, row):
 def test_every_data_set_replays_its_rows(data, batch_size):
     env = ReplayEnv(data, batch_size=batch_size, length=4)
     check_env_specs(env)
-    env.set_seed(0)  # the turn begins anew
+    env.set_seed(0)  # the turn is reset
     rollout = env.rollout(100)
     assert rollout.batch_size == (*batch_size, 3)
     count = max(1, torch.Size(batch_size).numel())

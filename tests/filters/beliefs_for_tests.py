@@ -1,4 +1,4 @@
-"""Entries of a belief, and whether two beliefs are the same but for rounding."""
+"""Keys of a belief's entries, and an assertion that two beliefs are equal up to rounding."""
 
 from tests.filters.factories import assert_equal
 
@@ -7,5 +7,5 @@ BELIEF = [ENSEMBLE, MEAN, VAR]
 
 
 def close(first, second, keys, atol=1e-12):
-    """In float64: the rounding of a few steps."""
+    """Asserts that entries are equal up to the float64 rounding of a few steps."""
     assert_equal(first, second, keys, atol=atol)

@@ -46,7 +46,7 @@ class TransitionWithSpeed(LearnedTransition):
 
 
 def compose(features, *, frozen_start=True):
-    """A filter with some of ``FEATURES``, float64, free of randomness but that of its sub-models."""
+    """Returns a filter with some of ``FEATURES``, float64, free of randomness but that of its sub-models."""
     torch.manual_seed(0)
     layer = "flipout" if "flipout" in features else "dropout" if "dropout" in features else "none"
     kind = TransitionWithSpeed if "extra outputs" in features else LearnedTransition
@@ -91,7 +91,7 @@ def compose(features, *, frozen_start=True):
 
 
 def frames_for(features):
-    """Readings for every sensor, masks, actions and starts, ``[B, T]``."""
+    """Returns readings for every sensor, masks, actions and resets, ``[B, T]``."""
     torch.manual_seed(1)
     frames = TensorDict({"a": torch.randn(B, T, 4), "b": torch.randn(B, T, 4), "c": torch.randn(B, T, 2)}, [B, T])
     frames["action"] = torch.randn(B, T, A)
@@ -142,6 +142,6 @@ class ReplayedFrames(EnvBase):
         return seed
 
     def player(self):
-        """A policy that plays the recorded actions."""
+        """Returns a policy that plays the recorded actions."""
         actions = self.frames["action"]
         return TensorDictModule(lambda index: actions[:, index.flatten()[0]], ["index"], ["action"])

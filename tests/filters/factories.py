@@ -18,7 +18,7 @@ S, M, OBS, A, E = 3, 4, 2, 2, 4  # state, measurement, observation, action, memb
 
 
 def toy_denkf(scheme="sensor", layer="dropout", *, sensor_layer="dropout", ensemble_size=E, action=True, **kwargs):
-    """Four learned sub-models on a vector measurement and an action."""
+    """Returns four learned sub-models on a vector measurement and an action."""
     initial, in_key = kwargs.pop("initial", None), kwargs.pop("in_key", "measurement")
     return DEnKF(
         transition=LearnedTransition(
@@ -39,7 +39,7 @@ def toy_denkf(scheme="sensor", layer="dropout", *, sensor_layer="dropout", ensem
 
 
 def random_draws(filter):
-    """The filter, whose noise is used as it was drawn: what an oracle computes from the draws holds for it."""
+    """Returns the filter, whose noise is used as it was drawn: what an oracle computes from the draws holds for it."""
     for module in filter.modules():
         if hasattr(module, "exact"):
             module.exact = False
@@ -150,7 +150,7 @@ def linear_kalman(**kwargs):
 
 
 def linear_denkf(scheme="etkf", *, ensemble_size=6, noisy=False, control=None, initial=None, r=None, **kwargs):
-    """An ensemble filter of :func:`linear_system`, free of randomness unless ``noisy`` or ``initial`` say so."""
+    """Returns an ensemble filter of :func:`linear_system`; without ``noisy`` or ``initial`` it is deterministic."""
     F, Q, H, R = linear_system()
     generator = torch.Generator().manual_seed(0)
     members = torch.randn(ensemble_size, 2, generator=generator, dtype=F.dtype)
@@ -172,7 +172,7 @@ def believing(threshold, **kwargs):
 
 
 def linear_with(modules, *, analysis=None, initial=None, **options):
-    """The filter of :func:`linear_denkf` behind other modules, some of them in the place of its own of that name."""
+    """Returns the filter of :func:`linear_denkf` with other modules in front, or instead of those of the same name."""
     plain = linear_denkf()
     parts = {**modules, **{name: plain[name] for name in ("noise", "transition", "observation") if name not in modules}}
     parts.setdefault("analysis", plain["analysis"] if analysis is None else analysis)
@@ -180,7 +180,7 @@ def linear_with(modules, *, analysis=None, initial=None, **options):
 
 
 def parts_of_reading(index, before, after, scheme="etkf", **kwargs):
-    """Noise ``r``, observation ``h`` and analysis ``a`` of reading ``y``, 0 or 1, between two prefixes of ensembles."""
+    """Returns noise ``r``, observation ``h`` and analysis ``a`` of one reading, between two ensemble prefixes."""
     _, _, H, R = linear_system()
     return {
         f"r{index}": ConstantNoise(R[[index]].sqrt(), in_key=f"y{index}", out_key=f"r{index}"),

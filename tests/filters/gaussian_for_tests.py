@@ -27,7 +27,7 @@ INFO = [("info", name) for name in ("innovation", "nis", "log_likelihood")]
 
 
 def known_process_noise():
-    """The Q of :func:`linear_system`, as a module."""
+    """Returns the Q of :func:`linear_system`, as a module."""
     unit = ConstantNoise([1.0, 1.0], in_key=("belief", "mean"), out_key=("forecast", "noise"))
     return MappedNoise(unit, torch.linalg.cholesky(linear_system()[1]))
 
@@ -37,7 +37,7 @@ def prior():
 
 
 def linear_filter(name, *, control=False, process_noise=None, noise=None, **kwargs):
-    """The system of :func:`linear_system` in an EKF, a UKF or a Backprop KF."""
+    """Returns the system of :func:`linear_system` in an EKF, a UKF or a Backprop KF."""
     F, _, H, R = linear_system()
     control = torch.tensor(CONTROL) if control else None
     q = known_process_noise() if process_noise is None else process_noise
@@ -49,7 +49,7 @@ def linear_filter(name, *, control=False, process_noise=None, noise=None, **kwar
 
 
 def linear_frames(*batch, width=2, resets=True, missing=0.3):
-    """Readings, NaN where they are not observed, actions, and starts that differ between rows."""
+    """Returns readings, NaN where they are not observed, actions, and starts that differ between rows."""
     frames = TensorDict({"observation": torch.randn(*batch, 2), "action": torch.randn(*batch, 1)}, batch)
     frames["observed"] = torch.rand(*batch, width) >= missing
     frames["observation"] = torch.where(frames["observed"], frames["observation"], torch.nan)

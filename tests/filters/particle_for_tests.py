@@ -36,7 +36,7 @@ def toy_parts(ensemble_size=E):
 
 
 def toy_filter(scheme="soft", learned=False, **kwargs):
-    """All parts learned; the likelihood Gaussian, or learned on the measurement itself."""
+    """Returns all parts learned; the likelihood Gaussian, or learned on the measurement itself."""
     options = {"likelihood": LearnedLikelihood(M, OBS, num_cells=(8,), encoding_key="measurement")} if learned else {}
     if not learned:
         options["noise"] = DiagonalNoise(OBS, r=0.5, num_cells=(4,))
@@ -44,7 +44,7 @@ def toy_filter(scheme="soft", learned=False, **kwargs):
 
 
 def bootstrap(size, *, noisy=True, initial=None, observed_key="observed", **kwargs):
-    """The bootstrap filter of :func:`linear_system`, with the prior of :func:`linear_kalman`."""
+    """Returns the bootstrap filter of :func:`linear_system`, with the prior of :func:`linear_kalman`."""
     F, Q, H, R = linear_system()
     kf = linear_kalman()
     prior = GaussianPrior(kf.initial.mean, kf.initial.cov.diagonal().sqrt(), ensemble_size=size)

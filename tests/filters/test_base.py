@@ -103,7 +103,7 @@ def test_a_state_dict_is_all_that_is_learned(float64):
     assert_equal(fresh.sequence(frames.copy()), expected, filter.out_keys)
 
 
-def test_keep_returns_what_is_asked_for(float64):
+def test_keep_selects_the_outputs(float64):
     filter, frames = toy_denkf(), toy_frames((2, 3))
     filter.draw_noise(frames)
     expected = filter.sequence(frames.copy())

@@ -21,7 +21,7 @@ close = partial(assert_equal, atol=1e-10)  # float64: rounding of a few steps
 
 
 def stepped(filter, frames, carry=None):
-    """All steps of ``frames``, by ``filter.step``; rows with ``is_init`` start anew, the first from ``carry``."""
+    """Runs ``filter.step`` over ``frames``; rows with ``is_init`` are reset, the first row starts from ``carry``."""
     rows, out = frames.unbind(1), []
     for t, row in enumerate(rows):
         row = row.copy()

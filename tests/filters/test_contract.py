@@ -55,7 +55,7 @@ def lstm():
 
 
 def fused(kind, *, late=False, **kwargs):
-    """Two sensors that read the same entry, the second one perhaps two steps late."""
+    """Returns two sensors that read the same entry, the second one perhaps two steps late."""
     F, Q, H, R = linear_system()
     if kind == "Kalman":
         motion, initial = LinearTransition(F, Q), MomentPrior(torch.zeros(2), torch.eye(2))
@@ -108,7 +108,7 @@ some_filters = pytest.mark.parametrize(
 
 
 def readings(*batch, width=1):
-    """Readings, masks, and starts that differ between rows."""
+    """Returns readings, masks, and resets that differ between rows."""
     frames = TensorDict({"observation": torch.randn(*batch, 2)}, batch)
     frames["observed"] = torch.rand(*batch, width) < 0.7
     frames["is_init"] = torch.rand(*batch, 1) < 0.2
@@ -117,7 +117,7 @@ def readings(*batch, width=1):
 
 
 def with_noise(name, *batch, width=1):
-    """A filter, and readings with the noise of all its steps."""
+    """Returns a filter, and readings with the noise of all its steps."""
     filter = FILTERS[name]()
     return filter, filter.draw_noise(readings(*batch, width=width))
 
@@ -135,7 +135,7 @@ def test_specs(name, batch):
 
 
 @every_filter
-def test_rows_that_reset_start_anew_and_the_others_go_on(name):
+def test_partial_resets(name):
     env = filtered(name, batch_size=[2], max_steps=[3, 5])
     rollout = env.rollout(12, break_when_any_done=False)
     done = rollout["next", "done"].squeeze(-1)[:, :-1]
@@ -154,7 +154,7 @@ def test_steps_are_the_sequence(float64, name):
     row, rows = filter.initialise(frames[:, 0].copy()), []
     for t in range(7):
         row = frames[:, t].copy().update(row.select(*filter.carry_keys))
-        row = filter(row)  # a start starts anew
+        row = filter(row)  # a start starts again
         rows.append(row)
     assert_equal(torch.stack(rows, 1), expected, filter.out_keys, atol=1e-10)
     with set_recurrent_mode(True):
@@ -183,7 +183,7 @@ def test_compiled_is_eager(float64, name):
 
 @every_filter
 @pytest.mark.parametrize("width", [1, 2])
-def test_what_is_not_observed_may_be_anything(float64, name, width):
+def test_missing_readings_may_have_any_value(float64, name, width):
     filter, frames = with_noise(name, 3, 6, width=width)
     expected = filter.sequence(frames.copy())
     frames["observation"] = torch.where(frames["observed"], frames["observation"], torch.nan).requires_grad_()

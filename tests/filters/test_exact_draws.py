@@ -92,7 +92,7 @@ def of_two_sensors(process_noise):
 
 
 def iterated(process_noise, iterations):
-    """Each iteration moves the noise, which is then exact no more: its mean is not zero."""
+    """Shifts the noise in each iteration, so that its mean is not zero."""
     modules, options = parts()
     return IEnKS(*modules, observation_key="reading", process_noise=process_noise, iterations=iterations, **options)
 
@@ -153,7 +153,7 @@ def test_on_a_circle_members_lie_on_both_sides_of_the_turn():
 def test_a_gate_that_never_acts_changes_no_perturbation(space):
     """Each run of its analysis makes the draws exact for the predictions that are aligned there."""
     dim, start = space.tangent_dim, torch.zeros(space.point_dim).index_fill(0, torch.tensor([0]), 3.0)
-    start = space.plus(space.normalise(start), torch.zeros(dim))  # beside the turn of a circle
+    start = space.plus(space.normalise(start), torch.zeros(dim))  # next to the turn of a circle
     filter = DEnKF(
         LearnedTransition(nn.Identity(), residual=False),
         None,
@@ -172,7 +172,7 @@ def test_a_gate_that_never_acts_changes_no_perturbation(space):
 
 
 @pytest.mark.parametrize("hidden", [[False, True], [False, False]])
-def test_a_hidden_prediction_has_no_part_in_perturbed_readings(hidden):
+def test_masked_prediction_does_not_affect_perturbed_observations(hidden):
     """A prediction of NaN where nothing is read, such as the bearing of a landmark that nobody sees."""
     forecast, seen = torch.randn(E, S, requires_grad=True), ~torch.tensor(hidden)
     data = TensorDict({"reading": torch.ones(2), "observed": seen})
@@ -187,7 +187,7 @@ def test_a_hidden_prediction_has_no_part_in_perturbed_readings(hidden):
     assert out[3].isfinite().all()
 
 
-def test_noise_of_some_dimensions_before_and_behind_the_motion():
+def test_process_noise_of_some_dimensions_before_and_after_the_motion():
     f, _ = system()
     ensemble = torch.randn(5, E, S)
     td = TensorDict({("belief", "ensemble"): ensemble}, [5])
@@ -313,7 +313,7 @@ class Still(nn.Module):
         return td.set(("forecast", "ensemble"), td["belief", "ensemble"])
 
 
-def test_random_draws_stay_what_they_were():
+def test_random_draws_are_unchanged():
     td = TensorDict({("belief", "ensemble"): torch.randn(E, S), ("noise", "self"): torch.randn(E, S)})
     noise = ConstantNoise(Q, in_key=("belief", "ensemble"))
     noisy = NoisyTransition(LearnedTransition(nn.Linear(S, S)), noise, draws="random")

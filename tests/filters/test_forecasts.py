@@ -1,4 +1,4 @@
-"""Tests which entry is the forecast of which, and modules that undo each other."""
+"""Tests which output of a transition is the forecast of which belief entry, and modules that overwrite each other."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from torch_denkf.modules import ConstantNoise, EnsembleAnalysis
 
 
 class Reversed(NoisyLinear):
-    """Writes something else before the forecast, and the forecast of a Kalman filter in another order."""
+    """Writes another entry before the forecast."""
 
     def __init__(self, matrix, control=None):
         super().__init__(matrix, control=control)
@@ -21,7 +21,7 @@ class Reversed(NoisyLinear):
         return (moved - state).norm(dim=-1), moved
 
 
-def test_forecasts_are_told_by_their_names(float64):
+def test_forecast_is_found_by_its_name(float64):
     F, _, _, _ = linear_system()
     plain = linear_denkf(update_at_reset=True)
     other = linear_with({"transition": Reversed(F)}, update_at_reset=True)
@@ -33,7 +33,7 @@ def test_forecasts_are_told_by_their_names(float64):
     assert (out["forecast", "speed"][:, 1:] > 0).all()
 
 
-def test_two_forecasts_of_one_name_raise_until_one_is_named():
+def test_ambiguous_forecast_raises_without_forecast_keys():
     F, *_ = linear_system()
 
     class Two(NoisyLinear):
@@ -48,11 +48,11 @@ def test_two_forecasts_of_one_name_raise_until_one_is_named():
     with pytest.raises(ValueError, match="forecast_keys="):
         linear_with({"transition": Two()})
     linear_with({"transition": Two()}, forecast_keys={ENSEMBLE: ("forecast", "ensemble")})
-    with pytest.raises(ValueError, match="forecast_keys names"):
+    with pytest.raises(ValueError, match="forecast_keys has"):
         linear_with({"transition": Two()}, forecast_keys={ENSEMBLE: ("nowhere", "ensemble")})
 
 
-def test_a_module_that_undoes_another_raises():
+def test_module_that_overwrites_an_unread_entry_raises():
     again = EnsembleAnalysis("etkf", observation_key="observation")
     with pytest.raises(ValueError, match=r"over what 'analysis' .* before any module has read it"):
         linear_with({**dict(linear_denkf().module.named_children()), "again": again})

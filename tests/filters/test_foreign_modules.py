@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def forecasts(filter):
-    """The forecast of a step, and that of the second element of a sequence from the same belief."""
+    """Returns the forecast of a step, and that of the second element of a sequence from the same belief."""
     frames = TensorDict({"observation": torch.randn(3, 2, 2)}, [3, 2])
     filter.draw_noise(frames)
     out = filter.sequence(frames.copy())
@@ -51,7 +51,7 @@ class OwnForward(NoisyLinear):
         return tensordict.set(FORECAST, 3.0 * tensordict[FORECAST])
 
 
-def test_a_forward_of_its_own_is_what_runs_and_it_finds_its_noise():
+def test_custom_forward_runs_with_its_noise():
     filter, (F, Q, *_) = linear_denkf(), linear_system()
     root = torch.linalg.cholesky(Q)
     filter = filter.with_modules(transition=OwnForward(F, root))

@@ -50,7 +50,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 class Stays(SubModel):
-    """States that stay where they are, but for noise."""
+    """States that stay where they are, except for noise."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("belief", "ensemble")], [("forecast", "ensemble")])
@@ -70,7 +70,7 @@ class Whole(SubModel):
 
 
 def make(kind, space, model=None, reading_space=None, dim=None, key="pose"):
-    """A filter whose state is read as it is, or by a model of ``dim`` numbers, with an R that is trained."""
+    """Returns a filter whose state is read as it is, or by a model of ``dim`` numbers, with an R that is trained."""
     model, reading_space = (Whole(), space) if model is None else (model, reading_space)
     std, q = ([value] * space.tangent_dim for value in (0.2, 0.05))
     noise = ConstantNoise([0.1] * (dim or space.tangent_dim), in_key=key, trainable=True)
@@ -132,7 +132,7 @@ def filtered(filter, data, key="pose"):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SPACES)
-def test_a_hidden_number_does_not_matter(kind, name):
+def test_masked_value_has_no_effect(kind, name):
     space, filter = SPACES[name], make(kind, SPACES[name])
     data, hidden = frames(space)
     out, pose = filtered(filter, data)
@@ -147,7 +147,7 @@ def test_a_hidden_number_does_not_matter(kind, name):
 
 
 @pytest.mark.parametrize("kind", ["EKF", "etkf", "particles"])
-def test_a_position_without_its_heading_is_read_as_one(kind):
+def test_position_without_heading_is_a_partial_observation(kind):
     """Is what a model of the position alone says, whose noise is the same in all directions."""
     data, _ = frames(SE2())
     data = data[:1, 0]
@@ -162,7 +162,7 @@ def test_a_position_without_its_heading_is_read_as_one(kind):
     torch.testing.assert_close(out[VAR], expected[VAR], rtol=5 * near, atol=near)
 
 
-def test_the_heading_of_a_position_does_not_turn_it():
+def test_masked_heading_does_not_rotate_the_position():
     start, angles = torch.tensor([0.3, 0.0, 0.0]), (0.3, NAN, 0.0, 2.5)
     data = TensorDict({"start": start.expand(1, 4, 2, 3)}, [1, 4, 2])
     data["observed"] = torch.tensor([False, True, True]).expand(1, 4, 2, 3)
@@ -174,7 +174,7 @@ def test_the_heading_of_a_position_does_not_turn_it():
 
 @pytest.mark.parametrize("kind", ["EKF", "etkf"])
 @pytest.mark.parametrize("name", [name for name in SPACES if name != "numbers"])
-def test_a_rotation_that_is_not_a_number_is_a_missing_reading(kind, name):
+def test_nan_rotation_is_a_missing_observation(kind, name):
     """Its whole part is not known: the belief stands where it was, and its gradients are finite."""
     space = SPACES[name]
     data = frames(space)[0][:1, :1, :2].exclude("observed").expand(1, 2, 2).clone()
@@ -196,7 +196,7 @@ def test_a_rotation_that_is_not_a_number_is_a_missing_reading(kind, name):
 
 
 @pytest.mark.parametrize("name", SPACES)
-def test_covariances_of_members_are_of_tangents(name):
+def test_ensemble_covariance_is_in_the_tangent_space(name):
     """Also at a start, where they follow from the members."""
     space, data = SPACES[name], frames(SPACES[name])[0][0, :1].exclude("observed")
     filter = make("etkf", space)

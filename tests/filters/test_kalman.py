@@ -11,7 +11,7 @@ from torch_denkf.modules import GaussianPrior
 
 
 def numpy_kalman(F, Q, H, R, m0, P0, readings, observed, starts, update_at_reset):
-    """One row at a time, one step at a time, with plain inverses."""
+    """Runs one row and one step at a time, with plain inverses."""
     means, covs, squares, log_likelihoods = [], [], [], []
     m, P = m0, P0
     for y, seen, start in zip(readings, observed, starts, strict=True):
@@ -60,7 +60,7 @@ def test_sequence_equals_numpy(float64, update_at_reset, width):
 
 
 def joint_gaussian(kf, T, S=2):
-    """Mean and covariance of y_1 .. y_T, stacked, by the system's impulse responses."""
+    """Returns the mean and covariance of y_1 .. y_T, stacked, by the system's impulse responses."""
     F, Q, H, R = linear_system()
     F_to = [torch.linalg.matrix_power(F, k) for k in range(T)]
     mean = torch.cat([H @ power @ kf.initial.mean for power in F_to])

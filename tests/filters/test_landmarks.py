@@ -69,7 +69,7 @@ def range_bearing():
 
 
 def simulate_range_bearing(rows, steps):
-    """Truth, readings, and a start that is as wrong as the filter is told."""
+    """Returns true states, readings, and initial beliefs whose errors match the prior."""
     start = torch.tensor([0.0, 0.0, 0.0, 5.0, 0.4]).expand(rows, 5)
     state = start + torch.tensor(START_STD) * torch.randn(rows, 5)
     move, states = UnicycleTransition(torch.zeros_like, DT), [state]

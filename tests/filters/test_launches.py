@@ -12,7 +12,7 @@ STEPS = 20
 
 @pytest.fixture
 def workload(monkeypatch):
-    """The benchmark's filter and frames on ``device="meta"``."""
+    """Returns the benchmark's filter and frames on ``device="meta"``."""
     filter, frames = make_filter(), make_frames(2, STEPS + 1)
     row = frames[:, 0].copy().set(("belief", "ensemble"), start(filter, 2))
     monkeypatch.setattr(small_system, "GPUS", ("cuda", "meta"))

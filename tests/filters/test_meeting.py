@@ -119,5 +119,5 @@ def test_a_belief_that_torchrl_would_not_reset_raises(each):
         filter.make_tensordict_primer(),
         LastAction({("agents", "action"): "last"}),
     ):
-        with pytest.raises(ValueError, match=r"end in .*agents.* alone, and torchrl then keeps what stands outside"):
+        with pytest.raises(ValueError, match=r"end only in .*agents.*, and torchrl does not reset entries outside"):
             TransformedEnv(Groups(each=each), transform).rollout(2)

@@ -37,7 +37,7 @@ def assert_there(tensordict):
 
 
 def filtered(name, device):
-    """A filter, frames ``[3, 5]`` with noise, and the carry of the time before."""
+    """Returns a filter, frames ``[3, 5]`` with noise, and the carry of the time before."""
     filter = FILTERS[name]()
     frames = filter.draw_noise(readings(3, 3, width=2))
     start = filter.initialise(frames[:, 0].copy()).select(*filter.carry_keys)

@@ -19,7 +19,7 @@ def readings(*batch):
 
 
 def by_steps(filter, frames):
-    """Means of single steps with the noise in ``frames`` ``[B, T]``, from the belief that is stored at the first."""
+    """Returns means of single steps with the noise in ``frames`` ``[B, T]``, from the first stored belief."""
     row, means = frames[:, 0].copy(), [frames[ENSEMBLE][:, 0].mean(-2)]
     for t in range(1, frames.shape[1]):
         row = filter.step(frames[:, t].copy().set(ENSEMBLE, row[ENSEMBLE]))
@@ -47,7 +47,7 @@ class Unsaid(FixedEnsemble):
 
 
 def foreign_noise(filter):
-    """The noise from a module that does not say how many readings it is for."""
+    """Returns the noise from a module that does not say how many readings it is for."""
     _, _, _, R = linear_system()
     filter = filter.with_modules(noise=TensorDictModule(nn.Linear(2, 2), ["observation"], [("sensor", "noise")]))
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The forms that a GPU takes, run on a processor: each filter believes the same, and has the same gradients."""
+"""The forms that a GPU takes, run on a processor: beliefs and gradients are equal."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def gpu(monkeypatch):
 
 
 @every_filter
-def test_each_filter_believes_the_same(float64, gpu, name):
+def test_filters_agree_with_the_cpu(float64, gpu, name):
     filter, frames = with_noise(name, 3, 6, width=2)
     outs = []
     for turn in (lambda: None, gpu):

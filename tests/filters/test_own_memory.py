@@ -101,7 +101,7 @@ TAKES = {
 
 @pytest.mark.parametrize("name", TAKES)
 @pytest.mark.parametrize("kind", ["tensor", "array"])
-def test_constructors_copy_what_they_are_given(name, kind):
+def test_constructors_copy_their_arguments(name, kind):
     make, shapes = TAKES[name]
     values = [torch.eye(2) if shape == MATRIX else torch.ones(2) for shape in shapes]
     given = values if kind == "tensor" else [value.numpy() for value in values]

@@ -90,7 +90,7 @@ def build(features):
 
 
 def frames_for(features):
-    """Pictures and readings ``[ROWS, T]`` of which some are black, late, missing or NaN."""
+    """Returns images and readings ``[ROWS, T]``, some of them black, late, missing or NaN."""
     generator = torch.Generator().manual_seed(0)
     pixels = 0.5 + 0.4 * torch.rand(ROWS, T, 1, 2, 2, generator=generator)
     wheel = torch.randn(ROWS, T, 1, generator=generator)
@@ -112,7 +112,7 @@ def frames_for(features):
 
 
 def correct(mean, cov, h, reading, r):
-    """One scalar reading; also its innovation and how much it varies."""
+    """Returns one scalar reading; also its innovation and how much it varies."""
     innovation, s = reading - h @ mean, h @ cov @ h + r
     gain = cov @ h / s
     keep = np.eye(len(mean)) - np.outer(gain, h)
@@ -120,7 +120,7 @@ def correct(mean, cov, h, reading, r):
 
 
 def oracle(features, frames):
-    """Mean, variance, smoothed mean of the oldest state carried, and the monitor's p-value, ``[ROWS, T, ...]``."""
+    """Returns mean, variance, smoothed mean of the oldest clone, and the monitor's p-value, ``[ROWS, T, ...]``."""
     has, lag = features.__contains__, 3 if "joint past" in features else 2 * ("late reading" in features)
     found = {name: np.zeros((ROWS, T, 2)) for name in ("mean", "var", "smoothed")} | {"p": np.ones((ROWS, T, 1))}
     for row in range(ROWS):
@@ -154,7 +154,7 @@ def oracle(features, frames):
 
 
 def forecast(mean, cov):
-    """The present state moves on in front of the past ones; the oldest is forgotten."""
+    """Shifts the clones by one step, and drops the oldest."""
     move = np.eye(len(mean), k=-2)
     move[:2, :2] = F
     cov = move @ cov @ move.T
@@ -174,7 +174,7 @@ def read(features, frames, row, t, lag):
 
 
 def weighted(readings, noise, mean, cov):
-    """The noise divided by what :class:`Doubt` says, in the forecast."""
+    """Returns the noise divided by what :class:`Doubt` says, in the forecast."""
     size = {}
     for name, (reading, h, seen) in readings.items():
         size[name] = (reading - h @ mean) ** 2 / (h @ cov @ h + noise[name]) if seen else 0.0
@@ -277,7 +277,7 @@ def test_all_features_at_once(float64, way):
 
 
 def test_the_oracle_answers_to_each_feature():
-    """Each feature but names and storage changes what is believed: a feature that did nothing would be no test."""
+    """Each feature except names and storage changes the belief, so that the other tests are not vacuous."""
     plain = oracle((), frames_for(()))
     for feature in ("gate", "late reading", "black picture", "learned weights", "inflation", "reject"):
         other = oracle((feature,), frames_for((feature,)))

@@ -51,7 +51,7 @@ def test_missing_frames_are_pure_prediction(float64, scheme, learned):
 
 
 @pytest.mark.parametrize("scheme", ["systematic", "soft", "transport"])
-def test_resampling_heeds_a_mask_of_another_name(float64, scheme):
+def test_resampling_uses_a_mask_of_another_name(float64, scheme):
     frames = TensorDict({"observation": torch.randn(3, 8, 2)}, [3, 8])
     frames["observed"] = torch.rand(3, 8, 1) < 0.6
     frames["observed"][:, 3:5], frames["observed"][:, 2] = False, True
@@ -72,7 +72,7 @@ def test_resampling_heeds_a_mask_of_another_name(float64, scheme):
 
 
 @pytest.mark.parametrize("scheme", ["systematic", "soft", "transport"])
-def test_where_gradients_go(float64, scheme):
+def test_gradient_flow(float64, scheme):
     filter = toy_filter(scheme)
     frames = filter.draw_noise(toy_frames((2, 6), resets=False, masks=0))
     frames["measurement"].requires_grad_()
@@ -96,5 +96,5 @@ def test_gradient_through_a_sequence_by_finite_differences(float64):
     loss = lambda: filter.sequence(frames.copy())["belief", "mean"].square().sum()  # noqa: E731
     loss().backward()
     parts = [filter[name] for name in ("transition", "observation", "noise")]
-    # A particle that is picked anew within 1e-6 would show as a difference of order 1e6.
+    # A particle that is picked again within 1e-6 would show as a difference of order 1e6.
     assert check_largest_gradients(parts, loss, rtol=1e-5, atol=1e-7) >= 8

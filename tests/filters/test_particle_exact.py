@@ -87,7 +87,7 @@ def test_the_estimate_of_the_likelihood_is_unbiased(float64):
     assert ratio.log().mean() < -0.05
 
 
-def test_without_resampling_it_is_importance_sampling(float64):
+def test_without_resampling_equals_importance_sampling(float64):
     # Deterministic motion: the weights are the products of the readings' densities along each particle's path.
     F, _, H, R = linear_system()
     start = GaussianPrior(torch.zeros(2), torch.ones(2), ensemble_size=E)

@@ -1,4 +1,4 @@
-"""The presets are made of the parts they say, parts that are there already are kept, and clones move along."""
+"""The presets are made of the parts they say, parts that are set already are kept, and clones move along."""
 
 import pytest
 import torch
@@ -66,5 +66,5 @@ def test_a_raw_reading_is_read_where_the_key_says(float64, preset):
     td = expected.draw_noise(td)
     assert_equal(found.sequence(td.copy()), expected.sequence(td.copy()), BELIEF)
 
-    with pytest.raises(ValueError, match="say where the reading is: observation_key="):
+    with pytest.raises(ValueError, match="pass the key of the reading: observation_key="):
         preset(motion, None, LinearObservation(H), noise=noise, **options)

@@ -41,7 +41,7 @@ def cubic_filter(size=1000, resampling="systematic", **kwargs):
 
 
 def drive(seed=0):
-    """Readings at each sixth step, and the true states, ``[T]`` each."""
+    """Returns readings at each sixth step, and the true states, ``[T]`` each."""
     random = np.random.default_rng(seed)
     state, states = 0.5 * random.standard_normal(), []
     for _ in range(STEPS):
@@ -52,7 +52,7 @@ def drive(seed=0):
 
 
 def numpy_bootstrap(readings, observed, size=100_000):
-    """Means and variances from the first reading on; particles that are no number any more have no weight."""
+    """Returns means and variances from the first reading on; particles that are no number any more have no weight."""
     random = np.random.default_rng(1)
     particles, weights = PRIOR * random.standard_normal(size), np.full(size, 1 / size)
     moments = []
@@ -82,7 +82,7 @@ def frames(readings, observed, *batch):
 @pytest.mark.filterwarnings("ignore:The variance")
 @pytest.mark.parametrize("resampling", ["systematic", "soft", None])
 @pytest.mark.parametrize("precision", ["single", "float64"])
-def test_particles_that_run_away_leave_the_others_as_they_are(resampling, precision, request):
+def test_diverged_particles_do_not_affect_the_others(resampling, precision, request):
     if precision == "float64":
         request.getfixturevalue(precision)
     filter, (readings, observed, states) = cubic_filter(300, resampling), drive()
@@ -110,7 +110,7 @@ def test_gradients_stay_finite(resampling):
     assert gradient != 0
 
 
-def test_where_all_particles_are_lost_the_filter_says_so():
+def test_losing_all_particles_raises():
     filter = cubic_filter(8)
     readings, observed, _ = drive()
     frame = filter.initialise(frames(readings, observed)[0])
@@ -119,7 +119,7 @@ def test_where_all_particles_are_lost_the_filter_says_so():
         filter.step(filter.step(frame))
 
 
-def test_one_lost_particle_gives_its_weight_to_the_others():
+def test_weight_of_a_lost_particle_is_redistributed():
     """By hand: three particles with weights 1/2, 1/4, 1/4, of which the second runs away, are two with 2/3, 1/3."""
     filter = cubic_filter(3, None, variance_ceiling=None)
     entries = {"belief": {"ensemble": torch.tensor([[0.0], [1e10], [1.0]])}, "reading": torch.zeros(1)}

@@ -1,4 +1,4 @@
-"""Mixed precision is refused by name; process noise of zero, in an ensemble, in a replaced network."""
+"""Mixed precision raises; process noise of zero, in an ensemble, in a replaced network."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from torch_denkf.filters import EKF, UKF, KalmanFilter
 from torch_denkf.modules import ConstantNoise, LinearObservation, MomentPrior
 
 
-def test_float64_matrices_beside_float32_raise():
+def test_mixed_float64_and_float32_raise():
     F, Q, H, R = linear_system(torch.float64)
     with pytest.raises(TypeError, match=r"mean is torch.float32 and transition is torch.float64; convert one"):
         KalmanFilter(F, H, process_noise_cov=Q, noise=R.sqrt(), mean=torch.zeros(2), cov=torch.eye(2))

@@ -17,7 +17,7 @@ MEAN, VAR = ("belief", "mean"), ("belief", "var")
 
 
 def named(name, prefix="imu"):
-    """A filter of the contract's table, twice: without and with a prefix, under one noise."""
+    """Returns a filter of the contract's table, twice: without and with a prefix, under one noise."""
     plain, other = FILTERS[name](), FILTERS[name]()
     other = other.with_options(prefix=prefix)
     frames = plain.draw_noise(readings(3, 6))
@@ -48,7 +48,7 @@ def test_a_prefix_changes_names_and_nothing_else(float64, name):
 
 
 def by_hand(readings, q=0.25, r=1.0):
-    """A scalar Kalman filter ``[T]``; the first element is its prior."""
+    """Returns a scalar Kalman filter ``[T]``; the first element is its prior."""
     means, m, p = [0.0], 0.0, 1.0
     for y in readings[1:]:
         p += q
@@ -91,7 +91,7 @@ def test_two_filters_of_one_environment(float64, way):
             torch.testing.assert_close(again[key], out[key], rtol=0, atol=1e-12)
 
 
-def test_a_belief_that_another_filter_of_the_policy_wrote_is_told():
+def test_belief_of_another_filter_warns():
     one, two = random_walk(), random_walk()
     row = TensorDict({"observation": torch.ones(1)}, [])
     row = one(row.set(("previous", *MEAN), torch.zeros(1)).set(("previous", "belief", "cov"), torch.eye(1)))

@@ -1,4 +1,4 @@
-"""An entry that a module both reads and writes is carried, or refused; a mask that nobody reads is refused."""
+"""An entry that a module both reads and writes is carried or raises; an unread mask raises."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from torch_denkf.running import reads_of, writes
 
 
 @every_filter
-def test_what_is_read_and_written_is_carried(name):
+def test_entries_read_and_written_are_carried(name):
     filter = FILTERS[name]()
     modules = [module for _, module in filter.structure.modules]
     needed, optional = reads_of(modules)
@@ -24,7 +24,7 @@ def test_what_is_read_and_written_is_carried(name):
 
 
 def camera(*front, observed_key="observed", initial=None):
-    """A filter whose reading is the mean of a picture, with modules in front."""
+    """Returns a filter whose reading is the mean of a picture, with modules in front."""
     return Filter(
         {
             **dict(front),
@@ -48,7 +48,7 @@ class Count(SubModel):
         return count + 1
 
 
-def test_a_module_of_a_users_own_that_reads_what_it_writes_raises():
+def test_custom_module_that_reads_and_writes_an_entry_raises():
     with pytest.raises(ValueError, match=r"'count' \(Count\) writes 'count', which the filter also reads from outside"):
         camera(("count", Count()))
     tally = TensorDictModule(lambda count: count + 1, ["count"], ["count"])

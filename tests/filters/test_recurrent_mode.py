@@ -1,4 +1,4 @@
-"""torchrl's recurrent mode inside a filter: on for modules that read frames of a sequence, off for its steps."""
+"""torchrl's recurrent mode inside a filter: on for modules that process whole sequences, off inside a step."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ MEAN = ("belief", "mean")
 
 
 class Smoothed(TensorDictModuleBase):
-    """Adds up readings in time in recurrent mode, as torchrl's recurrent modules go through a sequence."""
+    """Sums readings over time in recurrent mode, as a recurrent module of torchrl would."""
 
     def __init__(self):
         super().__init__()
@@ -25,7 +25,7 @@ class Smoothed(TensorDictModuleBase):
 
 
 class Pushed(TensorDictModuleBase):
-    """Moves the forecast by one, and by a hundred where it takes its step for a sequence."""
+    """Moves the forecast by 1, or by 100 in recurrent mode."""
 
     def __init__(self):
         super().__init__()
@@ -37,7 +37,7 @@ class Pushed(TensorDictModuleBase):
 
 
 @pytest.mark.parametrize("mode", [False, True])
-def test_frames_of_a_sequence_are_one_and_steps_are_not(float64, mode):
+def test_recurrent_mode_is_on_for_frames_and_off_for_steps(float64, mode):
     filter = linear_with({"raw": Smoothed(), "transition": linear_denkf()["transition"], "push": Pushed()})
     frames = TensorDict({"raw": torch.randn(3, 6, 2)}, [3, 6])
     with set_recurrent_mode(mode):

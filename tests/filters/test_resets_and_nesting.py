@@ -112,7 +112,7 @@ ENDS = [("next", "done"), ("next", "truncated"), "done", ("next", "agents", "don
 
 
 @pytest.mark.parametrize("mark", [*ENDS, ("agents", "is_init")])
-def test_what_ends_an_episode_starts_the_next_unless_beginnings_are_marked(float64, mark):
+def test_done_starts_the_next_episode_unless_is_init_is_given(float64, mark):
     """SliceSampler sets both; an environment's time limit alone ends nothing where is_init says so."""
     filter, frames = linear_denkf(), TensorDict({"observation": torch.randn(2, 9, 2)}, [2, 9])
     begins = torch.zeros(2, 9, 1, dtype=torch.bool)
@@ -128,7 +128,7 @@ def test_what_ends_an_episode_starts_the_next_unless_beginnings_are_marked(float
 
 
 def test_other_modules_make_a_new_filter():
-    """The filter itself stays as it is, and the modules of both are the same but for the new one."""
+    """The filter itself stays as it is, and the modules of both are the same except for the new one."""
     filter = blocks(named=True)
     frames = TensorDict({"y0": torch.randn(5, 1), "y1": torch.randn(5, 1)}, [5])
     before = filter.structure
@@ -149,7 +149,7 @@ def test_other_modules_make_a_new_filter():
 
 
 @pytest.mark.parametrize("left_out", [["y0"], ["y1"], ["y0", "y1"]])
-def test_a_reading_of_a_sequence_is_left_out_as_if_it_were_masked(float64, left_out):
+def test_leaving_out_a_reading_equals_masking_it(float64, left_out):
     first, second = (
         parts_of_reading(i, *between, info_prefix=f"info{i}", observed_key=f"o{i}")[f"a{i}"]
         for i, between in enumerate([("forecast", "mid"), ("mid", "belief")])

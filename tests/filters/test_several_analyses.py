@@ -23,7 +23,7 @@ def readings(*batch):
 
 
 def reads(parts):
-    """The motion and the start of the linear system, and what reads."""
+    """Returns motion and initial belief of the linear system, and the sensors."""
     plain = linear_denkf()
     return Filter({"transition": plain["transition"], **parts}, initial=plain.initial)
 

@@ -61,7 +61,7 @@ class Orientation(SubModel):
 
 
 def make(kind, members=E, **options):
-    """A filter of orientations."""
+    """Returns a filter of orientations."""
     parts = (Turning(), None, Orientation(), ConstantNoise(R, in_key="pose"))
     known = {"process_noise": Q, "observation_key": "pose", "reading_space": SO3(), **options}
     around = AroundState(STD, ensemble_size=200 if kind == "particles" else members, state_key="start", space=SPACE)
@@ -83,7 +83,7 @@ def make(kind, members=E, **options):
 
 
 def log(steps=T, seed=0, hidden=True):
-    """True states, gyro, readings of the orientation, some of which are missing, and where a filter starts."""
+    """Returns true states, gyro, readings of the orientation, some of which are missing, and where a filter starts."""
     torch.manual_seed(seed)
     rates, turns, biases = torch.randn(B, steps, 3), [SO3().exp(2 * torch.randn(B, 3))], [0.1 * torch.randn(B, 3)]
     for t in range(steps - 1):
@@ -112,7 +112,7 @@ def turned(turn, value):
 
 
 def turned_beliefs(filter, turn, data):
-    """Filters data, and the same data in a world that is turned."""
+    """Filters data, and the same data in a rotated world."""
     other = data.clone()
     for key in ("start", "pose"):
         other[key] = turned(turn, data[key])
@@ -130,7 +130,7 @@ def assert_turned(here, there, turn, atol):
 
 
 def numpy_ekf(data):
-    """An error-state extended Kalman filter of one run, with scipy's rotations: means and covariances at each step."""
+    """Runs an error-state extended Kalman filter with scipy's rotations: means and covariances at each step."""
 
     def right(v):  # the right Jacobian
         a, k = np.linalg.norm(v), np.cross(np.eye(3), v)
@@ -225,7 +225,7 @@ def test_a_turned_world_turns_the_belief_and_nothing_else(kind, turn):
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "lagged", "gated EKF"])
-def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
+def test_missing_reading_equals_masked_reading(kind):
     filter = FixedLag(make("EKF"), 2) if kind == "lagged" else make(kind.split()[-1])
     filter = Gated(filter, response="student", window=1, rate=1e-2) if kind == "gated EKF" else filter
     start = filter.initialise(with_noise(filter, log(steps=3))[:, 1].clone())
@@ -236,7 +236,7 @@ def test_a_reading_that_is_missing_is_one_that_is_hidden(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
+def test_gradients_are_finite_under_masks_and_at_half_a_turn(kind):
     filter, data = make(kind), log()
     data["pose"][0, 6] = SO3().plus(data["pose"][0, 5], torch.tensor([torch.pi, 0.0, 0.0]))
     data["start"].requires_grad_()
@@ -252,7 +252,7 @@ def test_gradients_are_finite_also_behind_masks_and_half_a_turn_away(kind):
 # -------------------------------------------------------------------------------------------------------- what is told
 
 
-def test_what_does_not_fit_raises():
+def test_mismatched_spaces_raise():
     with pytest.raises(TypeError, match=r"space is a Space, such as SO3\(\)"):
         AroundState([0.1] * 3, space="SO3")
     with pytest.raises(ValueError, match=r"tangent has shape \[4\]; a tangent of SO3\(\) is \[\*, 3\]"):
@@ -302,7 +302,7 @@ class Both(SubModel):
 
 
 def in_one(kind, lag=None, **options):
-    """A joint update of a pose and of numbers; and one update of both, side by side."""
+    """Returns a joint update of a pose and of numbers; and one update of both, side by side."""
     around = AroundState(STD, ensemble_size=E, state_key="start", space=SPACE)
     initial = GaussianAround(STD, state_key="start", space=SPACE) if kind in ("EKF", "UKF") else around
     sensors = {

@@ -1,4 +1,4 @@
-"""Sequences that go on from stored beliefs: of a run, with a past, or of a policy. Oracles: the run, single steps."""
+"""Sequences that continue from stored beliefs of a run, a lag window or a policy. Oracles: the run, single steps."""
 
 import pytest
 import torch
@@ -43,8 +43,8 @@ def begins_at(*times, size=(2, 9)):
 @pytest.mark.parametrize("name", RESUMED)
 @pytest.mark.parametrize(("begin", "stored"), [(1, "belief_keys"), (5, "belief_keys"), (4, "carry_keys")])
 @pytest.mark.parametrize("marked", [False, True])
-def test_a_sequence_goes_on_from_the_middle(name, begin, stored, marked):
-    """From all that was believed; or from what is carried, of which what was smoothed follows."""
+def test_sequence_resumes_from_the_middle(name, begin, stored, marked):
+    """Resumes from the whole belief, or from the carry, from which the smoothed entries follow."""
     filter = RESUMED[name]()
     frames = filter.draw_noise(readings(2, 9))
     whole = filter.sequence(frames.copy())
@@ -57,7 +57,7 @@ def test_a_sequence_goes_on_from_the_middle(name, begin, stored, marked):
     assert not torch.equal(whole["belief", "mean"][:, -1], whole["belief", "mean"][:, 0])
 
 
-def test_an_iterated_smoother_goes_on_too():
+def test_iterated_smoother_resumes():
     plain = linear_denkf()
     parts = [plain["transition"], None, plain["observation"], plain["noise"]]
     filter = IEnKS(*parts, initial=plain.initial, observation_key="observation", process_noise=[0.0, 0.0])
@@ -77,7 +77,7 @@ def test_an_iterated_smoother_goes_on_too():
         torch.testing.assert_close(alone[key][:, 0], own.to(alone[key].dtype), rtol=0, atol=1e-12)
 
 
-def test_beliefs_count_where_marks_say_so_and_where_all_that_is_carried_is_stored():
+def test_stored_beliefs_are_used_at_marks_if_complete():
     filter, frames = linear_denkf(), readings(2, 9)
     frames["is_init"] = torch.zeros(2, 9, 1, dtype=torch.bool)
     frames["is_init"][1, 5] = True
@@ -94,7 +94,7 @@ def test_flat_slices_are_the_slices():
     flat = torch.cat([whole[start : start + 5] for start in starts])
     expected = flat.clone()
     flat["is_init"] = (torch.arange(15) % 5 == 0).unsqueeze(-1)
-    torch.nn.init.normal_(flat["forecast", "ensemble"])  # what follows from the belief is computed anew
+    torch.nn.init.normal_(flat["forecast", "ensemble"])  # what follows from the belief is computed again
     out = filter.sequence(flat)
     close(out, expected, BELIEF)
     inside = ~flat["is_init"].squeeze(-1)
@@ -121,7 +121,7 @@ def policy_data(filter, *, anew=()):
 @every_filter
 @pytest.mark.parametrize("anew", [(), (3,), (0, 5)])
 def test_every_element_is_a_step_diagnostics_and_all(name, anew):
-    """Without a belief before it, an element starts anew: not from what the policy stored for its actor."""
+    """Without a belief before it, an element is reset: not from what the policy stored for its actor."""
     filter = FILTERS[name]()
     data, steps = policy_data(filter, anew=anew)
     close(filter.sequence(data.copy()), steps, filter.out_keys)
@@ -151,7 +151,7 @@ def test_within_a_slice_the_belief_is_the_filters_own(name):
     parts = [filter.sequence(part.copy()) for part in (data[:, :4], data[:, 4:])]
     data["is_init"] = begins_at(0, 4, size=(2, 7))
     close(filter.sequence(data.copy()), torch.cat(parts, 1), filter.out_keys)
-    close(filter(data[:, 4].copy()), parts[1][:, 0], filter.out_keys)  # a step goes on, too
+    close(filter(data[:, 4].copy()), parts[1][:, 0], filter.out_keys)  # a step continues, too
     assert filter.stepped(data).all()
     assert not filter.stepped(data.exclude("previous"))[:, [0, 4]].any()
 
@@ -169,8 +169,8 @@ def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
 
 @every_filter
 @pytest.mark.parametrize("update_at_reset", [False, True])
-def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_reset):
-    """As in a transform. In the other row, and where the first frame is used, it is refused."""
+def test_nan_in_an_unused_reading_of_a_reset_is_allowed(name, update_at_reset):
+    """NaN raises only in rows that are not reset, or if the first frame is used."""
     filter = FILTERS[name]().with_options(update_at_reset=update_at_reset)
     row = policy_data(filter, anew=(0,))[0][:, 0]
     row["previous", "known"][1] = True
@@ -183,7 +183,7 @@ def test_a_reading_that_a_start_does_not_use_may_be_anything(name, update_at_res
         torch.testing.assert_close(filter(first)["belief", "mean"], filter(row.copy())["belief", "mean"])
 
 
-def test_a_start_that_is_made_of_the_reading_uses_it():
+def test_initial_belief_from_the_reading_propagates_nan():
     start = FromSensor([0, 1], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="observation")
     broken = TensorDict({"observation": torch.zeros(2, 3, 2)}, [2, 3])
     broken["observation"][1, 0] = torch.nan

@@ -26,7 +26,7 @@ def test_any_points_are_exact_on_a_linear_system(float64, alpha, beta, kappa):
 
 
 def vehicle(lags):
-    """A vehicle whose pose is known at the start; with ``lags`` its state holds past velocities, too."""
+    """Returns a vehicle whose pose is known at the start; with ``lags`` its state holds past velocities, too."""
     net = StochasticMLP(2, 2, (8,), activation=nn.Tanh, output_gain=0.1, layer="flipout")
     transition = UnicycleTransition(net, 0.1, scale=[5.0, 0.2])
     initial = GaussianAround([0.0, 0.0, 0.0, 0.5, 0.02])

@@ -27,7 +27,7 @@ def kalman(ceiling, cov, mean=(1.0, -2.0)):
 
 
 @pytest.mark.parametrize("sequence", [False, True])
-def test_a_compiled_filter_holds_it_and_says_so_once(sequence):
+def test_compiled_filter_clamps_and_warns_once(sequence):
     cov, outs = torch.tensor([[399.0, 60.0], [60.0, 24.0]]), []
     for chunk in (0, 2):
         filter = kalman(100.0, cov).compile(chunk=chunk, backend="eager")

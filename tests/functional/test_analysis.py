@@ -225,7 +225,7 @@ def test_compiled_equals_eager_forward_and_backward(sizes, schemes, backend):
         ({"forecast": torch.zeros(1, 2)}, "forecast has E = 1 members"),
         ({"predicted": torch.zeros(4, 3)}, r"predicted must be \[\*B, E, O\] = \[5, 3\], got \[4, 3\]"),
         ({"observation": torch.zeros(2)}, r"observation must be \[\*B, O\] = \[3\], got \[2\]"),
-        ({"observation": torch.zeros(3)}, "'sensor' needs one observation a member"),
+        ({"observation": torch.zeros(3)}, "'sensor' needs one observation per member"),
         ({"observation": torch.zeros(4, 3)}, "got 4 samples; give the sensor the ensemble_size"),
         ({"noise": torch.zeros(1)}, r"noise must be \[\*B, O\]"),
         ({"observed": torch.ones(2, dtype=torch.bool)}, "observed must be"),

@@ -27,7 +27,7 @@ def test_mean_covariance_and_correlations_are_exact(members, dim, state, scale, 
 @pytest.mark.parametrize(
     ("members", "dim", "state"), [(32, 5, 5), (8, 3, 6), (8, 6, 6), (8, 7, 3), (6, 9, 4), (4, 3, 40)]
 )
-def test_with_few_members_they_are_never_worse_than_random_ones(members, dim, state):
+def test_exact_draws_are_never_worse_than_random_draws(members, dim, state):
     ensemble = correlated(members, state, (2000,))
     anomalies = ensemble - ensemble.mean(-2, keepdim=True)
     q, errors = torch.eye(dim), []
@@ -76,7 +76,7 @@ def test_with_about_as_many_dimensions_as_members_the_mean_alone_is_exact(dim):
 
 
 @pytest.mark.parametrize(("further", "room"), [(3, True), (4, False)])
-def test_those_that_come_first_have_the_room(further, room):
+def test_first_draws_have_priority(further, room):
     """Of 12 members 2 draws leave room for 7 directions, whatever the precision of the members."""
     first, second = torch.randn(12, 4), torch.randn(12, further).double()
     draws = exact_draws(torch.randn(12, 2), first, second.float())

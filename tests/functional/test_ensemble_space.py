@@ -11,7 +11,7 @@ EXACT = {"rtol": 1e-9, "atol": 1e-9}
 
 
 def problem(scheme, size, dim, count, batch=(), noise=0.3, dtype=torch.float64):
-    """Arguments of analyse: neighbours in the state are correlated, the observation is off by about one."""
+    """Returns arguments of analyse: neighbours in the state are correlated, the observation is off by about one."""
     generator = torch.Generator().manual_seed(0)
 
     def randn(*shape):

@@ -143,7 +143,7 @@ def test_wrapped_differences_point_the_same_way_and_lie_within_half_a_turn():
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
 @pytest.mark.parametrize("samples", [True, False])
-def test_aligned_angles_do_not_depend_on_the_turns_they_came_in(batch, samples):
+def test_aligned_angles_do_not_depend_on_full_turns(batch, samples):
     predicted = torch.tensor([3.0, 5.0]) + 0.4 * torch.randn(*batch, 9, 2)
     reading = torch.tensor([-3.0, 5.0]) + 0.4 * torch.randn(*batch, *[7] * samples, 2)
     if samples:  # as many as members
@@ -164,7 +164,7 @@ def test_aligned_angles_do_not_depend_on_the_turns_they_came_in(batch, samples):
     assert ((own - center).abs() < math.pi).all()
 
 
-def test_what_a_mask_hides_may_be_nan():
+def test_masked_values_may_be_nan():
     predicted, reading = torch.randn(3, 5, 2), torch.full((3, 5, 2), torch.nan)
     reading[0] = 1.0
     observed = torch.tensor([[True], [False], [False]])

@@ -51,7 +51,7 @@ def test_cholesky_fails_loudly_and_only_where_it_fails():
 # The ridge of a root is relative, and 1e-14 times the dimension: its root is 1e-7.
 
 
-def test_root_of_what_is_definite_is_its_cholesky_factor(float64):
+def test_root_of_a_definite_matrix_is_its_cholesky_factor(float64):
     factor = torch.randn(5, 3, 3).tril()
     factor.diagonal(dim1=1, dim2=2).abs_().add_(0.5)
     units = torch.tensor([1e6, 1.0, 1e-6])  # metres and microradians alike
@@ -87,7 +87,7 @@ def test_gradient_of_a_root_is_that_of_a_root(float64):
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 8])
-def test_a_covariance_is_told_by_its_correlations(float64, size):
+def test_covariance_check_uses_correlations(float64, size):
     """Oracle: eigenvalues of the correlations; units that differ by 1e6 do not matter."""
     torch.manual_seed(0)
     root = torch.randn(200, size, size)
@@ -104,7 +104,7 @@ def test_a_covariance_is_told_by_its_correlations(float64, size):
         assert_compiled_is_eager(is_covariance, cov)
 
 
-def test_what_is_no_covariance_is_nan_and_only_that_row():
+def test_invalid_covariance_gives_nan_in_its_row_only():
     one = torch.tensor([[1.0, 0.5], [0.5, 1.0]])
     wrong = [
         [[1.0, 0.5], [0.4, 1.0]],

@@ -43,7 +43,7 @@ def test_taper_at_the_knots_and_its_curvature():
 @pytest.mark.parametrize("batch", [(), (2, 3)])
 @pytest.mark.parametrize("sizes", [(6, 5, 3), (5, 4, 4)])
 @pytest.mark.parametrize("tile", [1, 2, 4096])
-def test_where_all_is_near_it_is_the_global_transform(batch, sizes, tile):
+def test_full_neighbourhoods_equal_the_global_transform(batch, sizes, tile):
     parts = problem(*sizes, batch)
     expected = analyse(*parts, scheme="etkf").ensemble
     torch.testing.assert_close(letkf(*parts, everywhere(sizes[1], sizes[2]), tile=tile), expected, **EXACT)
@@ -68,7 +68,7 @@ def test_each_component_alone_is_its_own_kalman_update():
     torch.testing.assert_close(ensemble_cov(found).diagonal(), expected.cov.diagonal(), **EXACT)
 
 
-def test_what_is_not_observed_counts_nowhere():
+def test_missing_observations_have_no_effect():
     forecast, predicted, observation, noise = problem(6, 5, 3)
     mask = torch.tensor([True, False, True])
     broken = torch.where(mask, observation, torch.nan), torch.where(mask, noise, torch.nan)

@@ -52,7 +52,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def tangents(space, *batch, size=None):
-    """Random tangents; of a motion with rotations of one size, in rad."""
+    """Returns random tangents; of a motion with rotations of one size, in rad."""
     value = torch.randn(*batch, space.tangent_dim)
     if size is not None and space in ANGLES:
         turn, rest = value[..., : ANGLES[space]], value[..., ANGLES[space] :]
@@ -61,7 +61,7 @@ def tangents(space, *batch, size=None):
 
 
 def near(space, *batch, most=2.5):
-    """Random tangents whose logarithm is themselves: rotations below half a turn."""
+    """Returns random tangents whose logarithm is themselves: rotations below half a turn."""
     value = tangents(space, *batch)
     return value * (most / value.norm(dim=-1, keepdim=True).clamp_min(most))
 
@@ -71,7 +71,7 @@ def points(space, *batch):
 
 
 def matrix(space, point):
-    """The matrix whose product is that of the space."""
+    """Returns the matrix whose product is that of the space."""
     if isinstance(space, SE2):
         angle, x, y = point.unbind(-1)
         rows = [[angle.cos(), -angle.sin(), x], [angle.sin(), angle.cos(), y], [0 * x, 0 * x, 0 * x + 1]]
@@ -84,7 +84,7 @@ def matrix(space, point):
 
 
 def generator(space, tangent):
-    """The matrix whose exponential is the matrix of the point."""
+    """Returns the matrix whose exponential is the matrix of the point."""
     if isinstance(space, SE2):
         angle, x, y = tangent.unbind(-1)
         zero = 0 * x
@@ -169,7 +169,7 @@ def test_rotations_are_those_of_mujoco():
 
 
 def test_quaternions_of_mujocos_matrices_in_all_quadrants():
-    """Each of the four numbers is the largest once, with all signs of the others; and is all there is."""
+    """Each of the four components is the largest once, with all signs of the others, or the only one."""
     signs = torch.cartesian_prod(torch.tensor([5.0]), *[torch.tensor([1.0, -1.0])] * 3)
     stack = torch.cat([torch.eye(4), *(signs.roll(place, -1) for place in range(4)), points(SO3(), 100)])
     stack = stack / stack.norm(dim=-1, keepdim=True)
@@ -184,7 +184,7 @@ def test_quaternions_of_mujocos_matrices_in_all_quadrants():
 
 
 @pytest.mark.parametrize("space", SPACES, ids=repr)
-def test_steps_lead_there_and_back(space):
+def test_plus_and_minus_are_inverse(space):
     point, tangent = points(space, 3, 20), near(space, 3, 20)
     moved = space.plus(point, tangent)
     torch.testing.assert_close(space.minus(moved, point), tangent, rtol=0, atol=1e-11)
@@ -206,7 +206,7 @@ def test_steps_lead_there_and_back(space):
 
 
 @pytest.mark.parametrize("space", SPACES, ids=repr)
-def test_a_step_on_the_left_is_the_adjoints_on_the_right(space):
+def test_adjoint(space):
     point, tangent = points(space, 30), near(space, 30, most=1.0)
     left = space.compose(space.exp(tangent), point)
     back = space.adjoint(space.inverse(point)) @ tangent.unsqueeze(-1)
@@ -217,12 +217,12 @@ def test_a_step_on_the_left_is_the_adjoints_on_the_right(space):
 
 
 @pytest.mark.parametrize("space", SPACES, ids=repr)
-def test_bases_are_the_derivatives_of_steps(space):
+def test_bases_are_derivatives_of_plus(space):
     point, zero = points(space), torch.zeros(space.tangent_dim)
     plus = torch.func.jacrev(lambda step: space.plus(point, step))(zero)
     minus = torch.func.jacrev(lambda other: space.minus(other, point))(point)
     torch.testing.assert_close(space.basis(point), plus, **EXACT)
-    # A tangent says nothing of numbers off the space.
+    # Points off the space have no tangent.
     torch.testing.assert_close(space.dual_basis(point) @ plus, minus @ plus, **EXACT)
     torch.testing.assert_close(space.dual_basis(point) @ plus, torch.eye(space.tangent_dim), **EXACT)
 
@@ -239,7 +239,7 @@ def test_a_quaternion_and_its_negative_are_one_rotation():
 
 
 def of_one(function, *values):
-    """The derivative of ``function`` of vectors, by the first of them, of each row."""
+    """Returns the derivative of ``function`` of vectors, by the first of them, of each row."""
     return torch.func.vmap(torch.func.jacrev(function))(*values)
 
 
@@ -304,7 +304,7 @@ def test_all_sizes_of_rotations(space, size, dtype):
         if value.requires_grad:  # the derivatives of numbers and angles are constant
             (gradient,) = torch.autograd.grad(value.sum(), tangent, retain_graph=True)
             assert gradient.isfinite().all()
-    # exp and log undo each other, and so do their derivatives: that of both is the identity.
+    # exp and log are inverse, so the derivative of their composition is the identity.
     if size <= 3.1:
         both = of_one(lambda value: space.log(space.exp(value)), tangent.detach())
         identity = torch.eye(space.tangent_dim).to(dtype).expand_as(both)
@@ -350,7 +350,7 @@ def test_the_mean_of_moved_points_is_the_moved_mean(space):
     weights, move = torch.rand(12).softmax(-1), points(space)
     mean = space.mean(members, weights)
     left = space.mean(space.compose(move.expand_as(members), members), weights)
-    # The same numbers, but for rounding; of an opposite space they turn.
+    # The same values up to rounding; those of an opposite space rotate.
     loose = {"rtol": 0, "atol": 1e-7} if isinstance(space, Opposite) else {}
     assert_same_points(space, left, space.compose(move, mean), **loose)
     right = space.mean(space.compose(members, move.expand_as(members)), weights)
@@ -443,7 +443,7 @@ def test_the_length_of_a_readings_quaternion_does_not_matter(space):
 
 @pytest.mark.parametrize("space", [SO3(), SE2(), SE3(), Opposite(SE3()), Product(SE2(), Euclidean(2)), Flat(3, [1])])
 def test_a_mask_is_narrowed_to_whole_rotations_and_vectors(space):
-    """Says nothing of numbers that a hidden number mixes with; what is told does not depend on it."""
+    """The mask excludes components that a masked one mixes with; the others do not depend on it."""
     for hidden in range(space.tangent_dim):
         observed = torch.arange(space.tangent_dim) != hidden
         points, tangents = space.told(observed)

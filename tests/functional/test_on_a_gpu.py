@@ -39,7 +39,7 @@ def test_inverse_and_its_gradient(float64, as_on_a_gpu, size):
 
 
 @pytest.mark.parametrize("size", [2, LARGEST + 1])
-def test_what_is_not_positive_definite_is_nan_and_nothing_else(as_on_a_gpu, size):
+def test_indefinite_matrices_give_nan_in_their_row_only(as_on_a_gpu, size):
     matrix = torch.stack([torch.eye(size), -torch.eye(size), torch.zeros(size, size), torch.eye(size) * torch.nan])
     for value in as_on_a_gpu(inverse_of, matrix):
         assert value[0].isfinite().all()
@@ -59,7 +59,7 @@ def test_division_by_a_matrix_that_is_not_symmetric(float64, as_on_a_gpu):
 @pytest.mark.parametrize("largest", [0.0, 1e-8, 1.0, 1e3, 1e6])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 6e-15), (torch.float32, 6e-7)])
 def test_square_root_without_eigenvalues(as_on_a_gpu, function, largest, dtype, error):
-    """Its error beside eigenvalues in double precision: a few roundings, and what the matrix's own rounding makes."""
+    """The error against eigenvalues in double precision is a few roundings, plus that of the matrix itself."""
     gram = covariance(6, 4, rank=4)  # of four directions
     gram = gram * largest / torch.linalg.matrix_norm(gram, 2)[..., None, None]
     exact = function(gram)
@@ -111,7 +111,7 @@ def test_a_gpu_takes_no_tiles_of_a_cache(monkeypatch, as_on_a_gpu):
 
 @pytest.mark.parametrize("size", [2, LARGEST + 1])
 @pytest.mark.parametrize("place", [0, -1])
-def test_a_reading_of_infinite_noise_says_nothing(float64, as_on_a_gpu, size, place):
+def test_infinite_noise_equals_a_missing_reading(float64, as_on_a_gpu, size, place):
     forecast, noise = torch.randn(3, 16, size + 1, requires_grad=True), torch.ones(3, size)
     noise[:, place] = torch.inf
     given = forecast, 2 * forecast[..., :size], torch.randn(3, 16, size), noise

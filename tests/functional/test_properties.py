@@ -81,7 +81,7 @@ def test_an_analysis_in_other_units(seed, batch, members, states, readings, sche
 
 @FIXED
 @given(SEEDS, BATCHES, MEMBERS, DIMS, st.integers(2, 6), SCHEMES, SPACES, st.sampled_from([math.nan, math.inf, 1e300]))
-def test_what_is_not_observed_is_as_if_it_were_not_there(seed, batch, members, states, readings, scheme, space, junk):
+def test_missing_observation_equals_a_smaller_observation(seed, batch, members, states, readings, scheme, space, junk):
     problem = Problem(seed, batch, members, states, readings)
     seen = problem.draw.mask(readings)
     seen[0] = True
@@ -182,7 +182,7 @@ def test_sigma_points_have_the_moments(seed, batch, states, scale, spread, dtype
     found, found_cov = unscented_moments(points, weights)
     near = max(scale, spread)
     torch.testing.assert_close(found / near, mean / near, rtol=1e-9, atol=1e-9)
-    limit = 1e-7 + 1e-13 * (scale / spread) ** 2  # what is left of a spread that is small beside the mean
+    limit = 1e-7 + 1e-13 * (scale / spread) ** 2  # what is left of a spread that is small compared with the mean
     outer = units * units.unsqueeze(-1)
     torch.testing.assert_close(found_cov / outer, cov / outer, rtol=limit, atol=limit)
     assert sigma_points(mean.to(dtype), cov.to(dtype)).dtype == dtype

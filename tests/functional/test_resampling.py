@@ -233,7 +233,7 @@ def test_jitter_moves_the_copies_and_has_the_kernels_covariance():
     torch.testing.assert_close(torch.cov((moved[1:] - particles[0]).T), expected, rtol=0.02, atol=1e-5)
 
 
-def test_transport_does_not_look_where_particles_without_weight_are():
+def test_transport_ignores_particles_without_weight():
     particles, log_weights = problem((20,), size=40)
     near, far = particles.clone(), particles.clone()
     log_weights[:, :3] = -torch.inf

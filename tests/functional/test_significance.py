@@ -84,7 +84,7 @@ def test_a_square_root_update_by_one_reading_is_the_serial_one_with_a_smaller_ga
     torch.testing.assert_close(result.ensemble, forecast + move * slope, rtol=0, atol=1e-10)
 
 
-def test_constant_components_and_hidden_readings_are_left_alone(cases):
+def test_constant_components_and_masked_readings_are_unchanged(cases):
     forecast, predicted, reading, noise = cases
     forecast = forecast.clone()
     forecast[..., 3] = 2.0
@@ -143,7 +143,7 @@ def test_each_component_has_a_threshold_and_readings_have_their_mean(cases):
     torch.testing.assert_close(result, moved[..., :5], rtol=0, atol=1e-10)
 
 
-def test_the_past_is_moved_with_the_thresholds_of_the_state(cases):
+def test_clones_use_the_thresholds_of_the_state(cases):
     """A past that equals the present moves as the present does."""
     forecast, *given = cases
     thresholds = torch.tensor([0.5, 1.0, 1.5, 2.0, 2.5])
@@ -163,7 +163,7 @@ def test_the_local_module_weighs_as_its_formula(cases):
         LocalEnsembleAnalysis(near, localisation="significance", threshold=torch.ones(5))
 
 
-def test_more_numbers_than_fit_at_once_are_believed_as_far(float64, monkeypatch):
+def test_tiled_significance_equals_untiled(float64, monkeypatch):
     """More readings than members solve in ensemble space, so many states in tiles; with significance neither."""
     forecast, reading = torch.randn(5, 40), torch.randn(6)
     given = forecast, forecast[:, :6], reading, torch.ones(6)

@@ -87,7 +87,7 @@ def test_dimensions_without_variance_stay_and_gradients_are_finite():
 
 
 def test_gram_matrices_in_single_precision_have_points():
-    # Rank 2 in 9 dimensions from 1e-4 to 1e3, as metres beside milliradians: no NaN, and variances to rounding.
+    # Rank 2 in 9 dimensions from 1e-4 to 1e3, as for metres and milliradians: no NaN, and variances to rounding.
     scale = torch.logspace(-4, 3, 9)
     root = scale.unsqueeze(-1) * torch.randn(2000, 9, 2)
     cov = root @ root.mT

@@ -52,7 +52,7 @@ def ensemble(**options):
 
 
 def fused(**options):
-    """The second reading is two steps late."""
+    """Delays the second reading by two steps."""
     F, Q, H, R = linear_system()
     sensors = {
         "observation": FusedSensor(LinearObservation(H), R.sqrt()),
@@ -99,7 +99,7 @@ def test_a_forecast_through_known_inputs(make):
     torch.testing.assert_close(out["ahead", "belief", "var"], wide.diagonal(dim1=-2, dim2=-1), **tolerance)
 
 
-def test_beliefs_of_a_chunk_and_rows_that_look_less_far():
+def test_predictions_of_a_chunk_with_different_horizons():
     filter = kalman()
     out = filter.sequence(recorded())
     each = BeliefAhead(filter, K, each=True)(out.copy())["ahead", "belief", "mean"]
@@ -113,7 +113,7 @@ def test_beliefs_of_a_chunk_and_rows_that_look_less_far():
 
 
 @pytest.mark.parametrize("seconds", [0.2, 0.25])
-def test_a_transition_that_knows_the_length_of_its_step(seconds):
+def test_transition_with_a_variable_time_step(seconds):
     """x' = x + dt (speed): .25 s are two steps of .1 s and a half one."""
     moves = torch.nn.Linear(1, 1)
     moves.weight.data, moves.bias.data = torch.zeros(1, 1), torch.tensor([2.0])
@@ -132,7 +132,7 @@ def test_a_transition_that_knows_the_length_of_its_step(seconds):
 
 @pytest.mark.parametrize("space", [SE2(), SE3()], ids=["SE2", "SE3"])
 @pytest.mark.parametrize("start", [GaussianAround, AroundState], ids=["moments", "ensemble"])
-def test_a_pose_goes_on_along_its_screw(space, start):
+def test_pose_prediction_follows_its_screw_motion(space, start):
     """At a constant twist the pose is x exp(k dt xi), and its tangent J^k P J^kT, J by finite differences."""
     dt, D = 0.1, space.tangent_dim
     motion = ConstantTwist(space, dt)
@@ -171,7 +171,7 @@ def late_world(filter, **transform):
     return env
 
 
-def test_an_environments_actions_run_late_and_rows_start_anew():
+def test_action_latency_with_partial_resets():
     """The state itself follows the actions of K steps before, without noise."""
     F, _, H, _ = linear_system()
     env = LinearGaussianEnv(F, H, [0.0] * 2, [0.0] * 2, control=torch.tensor(B_), batch_size=[3], max_steps=[4, 9, 9])
@@ -184,11 +184,11 @@ def test_an_environments_actions_run_late_and_rows_start_anew():
 
 
 @pytest.mark.parametrize("options", [{}, {"prefix": "imu"}])
-def test_the_transform_looks_ahead_as_a_sequence_does(options):
+def test_transform_predictions_equal_those_of_a_sequence(options):
     filter = kalman(update_at_reset=True, **options)
     env = late_world(filter)
     check_env_specs(env)
-    data = env.rollout(9, break_when_any_done=False)  # a row starts anew within it, twice
+    data = env.rollout(9, break_when_any_done=False)  # a row is reset within it, twice
     rows = data.select("observation", "observed", NEXT, ("next", "done")).set("action", data[NEXT][:, :, 0])
     expected = BeliefAhead(filter, K)(filter.sequence(rows))
     keys = [("ahead", *filter.outer(("belief", name))) for name in ("mean", "var")]
@@ -197,7 +197,7 @@ def test_the_transform_looks_ahead_as_a_sequence_does(options):
 
 
 @pytest.mark.parametrize("make", [toy_denkf, toy_particles, toy_fused])
-def test_a_policy_that_reads_it_has_a_log_ratio_of_zero(make):
+def test_log_ratio_is_zero_for_a_policy_on_the_prediction(make):
     """Its draws are kept, too; slices begin anywhere, rows reset inside."""
     filter = make()
     ahead = BeliefAhead(filter, 2, keep=[("belief", "mean")])
@@ -227,7 +227,7 @@ def test_numbers_that_do_not_fit_raise(options, match):
         BeliefAhead(kalman(), **options)
 
 
-def test_what_is_missing_is_named():
+def test_missing_entries_are_named():
     filter = kalman()
     out = filter.sequence(recorded())
     with pytest.raises(KeyError, match="under_way"):

@@ -56,7 +56,7 @@ def known_noise():
 
 
 def sensors(**second):
-    """The two components of the linear system's reading, as two sensors."""
+    """Returns the two components of the linear system's reading, as two sensors."""
     _, _, H, R = linear_system()
     return {
         "first": FusedSensor(LinearObservation(H[:1]), R[:1].sqrt()),
@@ -78,7 +78,7 @@ def fused(kind, *, joint=False, lag=None, members=None, noisy=True, analysis=Non
 
 
 def readings():
-    """Readings of both sensors in their order, and masks; the first frame, which no update sees, hides all."""
+    """Returns readings of both sensors in their order, and masks; the first frame, which no update sees, hides all."""
     torch.manual_seed(0)
     y = torch.randn(B, T, 2)
     frames = TensorDict({"first": y[..., :1], "second": y[..., 1:]}, [B, T])
@@ -91,7 +91,7 @@ def readings():
 
 
 def as_kalman(frames):
-    """The frames for one Kalman filter of both sensors."""
+    """Returns the frames for one Kalman filter of both sensors."""
     out = frames.select("is_init")
     out["observation"] = torch.cat([frames["first"], frames["second"]], -1)
     out["observed"] = torch.cat([frames["first_observed"], frames["second_observed"]], -1)
@@ -99,7 +99,7 @@ def as_kalman(frames):
 
 
 def arriving(frames, late):
-    """The second sensor's readings when they arrive: at t comes that of t - late[t]."""
+    """Returns the second sensor's readings when they arrive: at t comes that of t - late[t]."""
     index = torch.arange(T) - late
     out = frames.copy()
     for key in ("second", "second_observed"):
@@ -110,7 +110,7 @@ def arriving(frames, late):
 
 
 def arrived(frames, late, now):
-    """The readings in their order, as far as they have arrived at ``now``."""
+    """Returns the readings in their order, as far as they have arrived at ``now``."""
     out = frames[:, : now + 1].copy()
     times = torch.arange(T) - late
     known = torch.isin(torch.arange(now + 1), times[: now + 1])
@@ -156,7 +156,7 @@ PATTERNS = {
 @pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_late_readings_give_what_they_give_in_order(float64, kind, joint, pattern):
+def test_late_readings_equal_ordered_readings(float64, kind, joint, pattern):
     frames, late = readings(), PATTERNS[pattern]
     key = {} if pattern == "three steps late" else {"late_key": "late"}
     out = fused(kind, joint=joint, delay=DELAY, **key).sequence(arriving(frames, late))
@@ -181,7 +181,7 @@ def test_late_readings_of_an_ensemble_whose_motion_is_known(float64, joint, patt
 
 
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kind):
+def test_readings_from_before_the_episode_are_ignored(float64, kind):
     frames = readings()
     members = torch.randn(7, 2, generator=torch.Generator().manual_seed(1))
     frames["is_init"][:, 6] = True
@@ -195,7 +195,7 @@ def test_what_belongs_to_the_time_before_an_episode_is_not_observed(float64, kin
 
 
 def moved_and_read(steps, late, reading, *, mean, cov, noise):
-    """A prior after so many steps, with one reading of the second sensor that was taken ``late`` steps before."""
+    """Returns the belief after some steps with one reading of the second sensor, taken ``late`` steps before."""
     F, Q, H, R = linear_system()
     for step in range(steps + 1):
         mean, cov = (F @ mean, F @ cov @ F.mT + noise * Q) if step else (mean, cov)
@@ -207,7 +207,7 @@ def moved_and_read(steps, late, reading, *, mean, cov, noise):
 
 @pytest.mark.parametrize("update_at_reset", [False, True])
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_a_late_reading_is_of_the_step_it_says_or_of_none(float64, kind, update_at_reset):
+def test_late_reading_belongs_to_its_stated_step_or_none(float64, kind, update_at_reset):
     """Draws every step of the episode; not one before, not one to come, not one beyond the lag."""
     members, (F, Q, _, _) = torch.randn(7, 2), linear_system()
     if kind == "Kalman":
@@ -255,7 +255,7 @@ SPREAD = {
 
 
 def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
-    """A Kalman filter by hand, one sensor after the other, each followed by inflation: beliefs and forecasts."""
+    """Runs a Kalman filter by hand, one sensor after the other, each followed by inflation."""
     F, Q, H, R = linear_system()
     means, covs = [mean.expand(B, 2)], [cov.expand(B, 2, 2)]
     moved = []
@@ -274,7 +274,7 @@ def inflated(frames, factor, *, noise=1.0, mean=None, cov=None):
     return means, covs, moved
 
 
-def test_inflation_spreads_the_present_and_the_past_follows_where_a_lag_is_put_around(float64):
+def test_lagged_belief_follows_the_inflated_present(float64):
     """The smoother of Rauch, Tung and Striebel, by hand: it takes the inflated belief of the present for the belief."""
     frames, lag, F = readings(), 3, linear_system()[0]
     out = FixedLag(fused("Kalman", analysis=SPREAD["Kalman"]), lag).sequence(frames.copy())
@@ -303,7 +303,7 @@ def test_an_ensemble_with_a_lag_inflates_its_present_alone(float64):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_inflation_that_would_spread_the_past_raises(joint):
+def test_inflation_of_clones_raises(joint):
     members = torch.randn(7, 2)
     for kind, analysis in SPREAD.items():
         with pytest.raises(ValueError, match=r"inflation or relaxation of .* let Refiltering make them again"):
@@ -368,7 +368,7 @@ def test_angles_side_by_side(float64):
     assert (means[0][-1, 0] > 3.1).all(), "further, not back through zero"
 
 
-def test_of_sampled_angles_side_by_side_the_mean_is_that_of_directions(float64):
+def test_mean_of_sampled_angles_is_circular(float64):
     samples = torch.tensor([torch.pi - 0.1, 0.3 - torch.pi, 0.1 - torch.pi]).unsqueeze(-1)  # by 0.1 beyond pi
     numbers = torch.tensor([[1.0], [2.0], [6.0]])
     td = TensorDict({"a": numbers, "b": samples, "qa": torch.ones(1), "qb": torch.ones(1)})
@@ -396,7 +396,7 @@ def test_covariances_of_readings_side_by_side(float64):
 
 
 def with_lasting_errors(*, joint=False, delay=0, kind=None):
-    """Two sensors of the linear system, each with lasting errors, around one that has none."""
+    """Returns two sensors of the linear system, each with lasting errors, around one that has none."""
     F, Q, H, R = linear_system()
     errors = [FadingBias([std], time, trainable=False) for std, time in ((0.8, 6.0), (1.5, 1e6))]
     sensors = {
@@ -414,7 +414,7 @@ def with_lasting_errors(*, joint=False, delay=0, kind=None):
 
 
 def lasting_errors_in_numpy(frames, Q):
-    """Mean and covariance of a textbook Kalman filter whose state ends with both errors; predict, then update."""
+    """Runs a textbook Kalman filter whose state ends with both sensors' biases."""
     F, _, H, R = (value.numpy() for value in linear_system())
     decay = np.exp([-1 / 6, -1e-6])
     f = block_diag(F, np.diag(decay))
@@ -454,7 +454,7 @@ def test_errors_that_last_are_those_of_a_kalman_filter_that_holds_them(float64, 
 
 
 @pytest.mark.parametrize("noise", [False, True])
-def test_what_an_error_and_a_linear_motion_learn(float64, noise):
+def test_gradients_of_coloured_noise_and_linear_motion(float64, noise):
     """F, B and Q of the user's own transition, and size and time of the error: gradients by finite differences."""
     F, Q, H, R = linear_system()
     error = FadingBias([0.8, 0.6], 6.0)
@@ -533,7 +533,7 @@ def test_what_raises():
     wrong = TensorDict({"a": torch.zeros(3, len(H)), "a_observed": torch.ones(3, 1)}, [3])
     with pytest.raises(TypeError, match=r"a_observed.* must be boolean"):
         FusedFilter(linear, one(delay=1), **moments).sequence(wrong)
-    with pytest.raises(TypeError, match="carries a past already"):
+    with pytest.raises(TypeError, match="already carries a lag window"):
         FixedLag(FusedFilter(linear, one(), **moments, lag=3), 2)
 
 

@@ -35,7 +35,7 @@ def _double(float64):
 
 
 def fused(kind, parts, std, q, r, *, space=None, reading_space=None, **sensor):
-    """A filter of one sensor."""
+    """Returns a filter of one sensor."""
     start = GaussianAround(std, state_key="start", space=space)
     motion = TRANSITIONS[kind](parts[0], as_process_noise(q, start.state_dim), space=space)
     sensor = {"observed_key": "observed", "reading_space": reading_space, "delay": DELAY, **sensor}
@@ -49,7 +49,7 @@ def orientations(kind, **sensor):
 
 
 def arriving(data, late):
-    """The readings when they arrive: at t comes that of t - late[t]; the first frame's is not used."""
+    """Returns the readings when they arrive: at t comes that of t - late[t]; the first frame's is not used."""
     index = torch.arange(T) - late
     out = data.clone()
     for key in ("pose", "observed"):
@@ -74,7 +74,7 @@ def test_small_angles_are_plain_numbers(kind):
 
 
 @pytest.mark.parametrize("kind", TRANSITIONS)
-def test_late_readings_give_nearly_what_filtering_again_gives(kind):
+def test_late_readings_nearly_equal_refiltering(kind):
     """Steps that were made before a reading came are linear in what it says; the error is a product of angles."""
     data = arriving(log(), LATE)
     out = orientations(kind, late_key="late").sequence(data.clone())

@@ -70,7 +70,7 @@ def test_units():
         message_rows(log, unit="h")
 
 
-def test_stamps_in_any_order_and_streams_one_behind_the_other():
+def test_unordered_stamps_and_consecutive_streams():
     random = np.random.default_rng(0)
     log = messages() + messages("imu", 400, 200.0) + [(1.7, "pose", [0.0])]
     expected = message_rows(log)

@@ -15,7 +15,7 @@ from torch_denkf.smoothers import ParticleSmoother
 
 
 def glider(**options) -> FusedFilter:
-    """Position and speed in continuous time; both read at once, or the speed alone."""
+    """Returns the position and speed in continuous time; both read at once, or the speed alone."""
     motion = ContinuousMotion(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
     sensors = {
         "both": FusedSensor(Select([0, 1]), "both_noise", **options),
@@ -38,7 +38,7 @@ def irregular_log(seed: int = 0, count: int = 40) -> list[tuple]:
 
 
 def kalman(log: list[tuple], start: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance behind the last message, from one message to the next."""
+    """Returns the mean and covariance behind the last message, from one message to the next."""
     mean, cov, now = np.zeros(2), np.eye(2), start
     for stamp, name, value, noise in sorted(log, key=lambda message: message[0]):
         dt, now = stamp - now, stamp
@@ -52,7 +52,7 @@ def kalman(log: list[tuple], start: float) -> tuple[np.ndarray, np.ndarray]:
     return mean, cov
 
 
-def test_a_log_gives_what_a_filter_gives_that_goes_from_message_to_message(float64):
+def test_log_equals_filtering_message_by_message(float64):
     log = irregular_log()
     rows = message_rows(log, start=0.0)
     assert rows["both_observed"].sum() == 41  # none is lost
@@ -62,7 +62,7 @@ def test_a_log_gives_what_a_filter_gives_that_goes_from_message_to_message(float
     assert_close(out["belief", "cov"][-1].numpy(), cov, rtol=1e-9, atol=1e-11)
 
 
-def test_delays_in_seconds_put_messages_where_they_belong(float64):
+def test_delays_in_seconds_shift_messages(float64):
     log = irregular_log()
     late = [(stamp + 0.45 * (name == "speed"), name, *rest) for stamp, name, *rest in log]
     rows = message_rows(late, delays={"speed": 0.45}, start=0.0)
@@ -82,7 +82,7 @@ def test_start(float64):
     assert_close(glider().sequence(after)["belief", "mean"][-1].numpy(), kalman(later, 4.0)[0], rtol=1e-9, atol=1e-11)
 
 
-def test_what_drives_is_the_mean_since_the_row_before(float64):
+def test_input_is_the_mean_since_the_previous_row(float64):
     """Integrates a parabola that is sampled finely: its integral. Beyond the samples it stays."""
     stamps = np.linspace(1.0, 3.0, 2001)
     log = [(stamp, "imu", [stamp**2, 1.0]) for stamp in stamps] + [(stamp, "gps", [0.0]) for stamp in (0.5, 3.5)]
@@ -110,7 +110,7 @@ def test_one_absurd_message_spoils_no_row_beyond_its_neighbours():
     assert_close(rows["imu"][20:], torch.ones(len(rows) - 20, 1))
 
 
-def test_what_drives_may_speak_before_the_start_and_twice_at_a_time():
+def test_input_before_the_start_and_duplicate_stamps():
     log = [(-1.0, "imu", [5.0]), (0.0, "imu", [7.0]), (0.0, "imu", [1.0]), (2.0, "imu", [1.0]), (1.0, "gps", [0.0])]
     rows = message_rows(log, driving=["imu", "imu"], start=0.0, dtype=torch.float64)
     assert rows["stamp"].flatten().tolist() == [0.0, 0.0, 1.0, 2.0]  # the message before the start is no row
@@ -135,7 +135,7 @@ def test_particles_go_back_over_a_step_of_no_length(float64):
     assert_close(smoothed["ensemble"][0], smoothed["ensemble"][1], rtol=0, atol=1e-9)
 
 
-def test_a_sensor_that_says_two_things_at_once():
+def test_two_messages_with_one_stamp():
     rows = message_rows([(1.0, "gps", [1.0]), (1.0, "gps", [2.0]), (1.0, "wheel", [3.0]), (2.0, "gps", [4.0])])
     assert rows["gps"].flatten().tolist()[1:] == [1.0, 2.0, 4.0]
     assert rows["gps"][0].isnan()  # what is not there is not taken for a reading by a motion
@@ -217,7 +217,7 @@ def test_a_regular_log_is_a_regular_filter(float64):
 
 
 def pose_log(covariance: bool) -> TensorDict:
-    """Poses at times of their own, each with the noise of its tangent."""
+    """Returns poses at times of their own, each with the noise of its tangent."""
     random, log = np.random.default_rng(0), []
     for row in range(12):
         root = 0.1 * random.normal(size=(6, 6))

@@ -1,4 +1,4 @@
-"""Late readings by filtering again: with the same noise, what readings in their order give, for any filter."""
+"""Refiltering of late readings equals filtering in order of time stamps, under the same noise."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ MEMBERS = torch.randn(7, 2, generator=torch.Generator().manual_seed(1), dtype=to
 
 
 def assert_in_order(filter, late, keys, atol=1e-10):
-    """At each time the belief is that of the readings, as far as they have arrived, in their order."""
+    """Asserts that each belief equals that of the readings received by then, in order of their time stamps."""
     frames = filter.draw_noise(readings())
     out = Refiltering(filter, LATE, DELAY).sequence(arriving(frames, late))
     for now in range(T):
@@ -53,7 +53,7 @@ def test_particles(float64, pattern):
 
 
 @pytest.mark.parametrize("kind", ["Kalman", "UKF"])
-def test_a_mean_and_a_covariance_as_by_the_joint_state(float64, kind):
+def test_gaussian_filters_equal_the_augmented_state(float64, kind):
     late = PATTERNS["out of order"]
     assert_in_order(fused(kind), late, BELIEF)
     out = Refiltering(fused(kind), LATE, DELAY).sequence(arriving(readings(), late))
@@ -62,7 +62,7 @@ def test_a_mean_and_a_covariance_as_by_the_joint_state(float64, kind):
         assert_close(out[key], expected[key], rtol=0, atol=1e-10)
 
 
-def test_learned_weights_judge_a_late_reading_beside_those_of_its_time(float64):
+def test_attention_weights_of_late_readings(float64):
     torch.manual_seed(0)
     weights = SensorAttention({"first": 1, "second": 1}, size=4)
     with torch.no_grad():
@@ -72,13 +72,13 @@ def test_learned_weights_judge_a_late_reading_beside_those_of_its_time(float64):
     assert_in_order(filter, PATTERNS["out of order"], [("belief", "ensemble")])
 
 
-def test_rows_whose_readings_are_late_by_different_steps_and_the_gradient(float64):
+def test_different_delays_in_a_batch_and_their_gradients(float64):
     filter = fused("ensemble", members=MEMBERS)
     frames = filter.draw_noise(readings())
     frames["second_observed"][:] = True
     late = torch.zeros(B, T, 1, dtype=torch.int64)
     rows = frames.copy()
-    for row, steps in enumerate((1, 2, 3)):  # in each another reading is late; nothing else is read at its arrival
+    for row, steps in enumerate((1, 2, 3)):  # a different delay in each row; no other reading at the arrival
         late[row, 5 + steps] = steps
         rows["second"][row, 5 + steps] = frames["second"][row, 5]
     rows["late"] = late
@@ -110,7 +110,7 @@ def test_readings_from_before_the_episode_or_the_window_are_not_used(float64):
         assert_close(out["belief", "ensemble"], expected, rtol=0, atol=1e-12)
 
 
-def test_noise_that_is_not_given_is_drawn_once_and_actions_drive_the_next_step(float64):
+def test_noise_is_drawn_once_and_actions_drive_the_next_step(float64):
     control = torch.tensor([[1.0, 0.0], [0.5, 1.0]])
     filter = linear_denkf("perturbed", noisy=True, control=control)
     frames = TensorDict({"observation": torch.randn(2, 6, 2), "action": torch.randn(2, 6, 2)}, [2, 6])
@@ -137,7 +137,7 @@ def test_noise_that_is_not_given_is_drawn_once_and_actions_drive_the_next_step(f
     assert_close(window.belief["belief", "ensemble"], again["belief", "ensemble"], rtol=0, atol=1e-12)
 
 
-def test_what_raises(float64):
+def test_invalid_arguments_raise(float64):
     filter, frames = fused("Kalman"), arriving(readings(), PATTERNS["out of order"])
     late = {"delay": DELAY}, {"delay": DELAY, "late_key": "late"}
     twice = [fused("Kalman", joint=joint, **options) for options in late for joint in (False, True)]
@@ -175,7 +175,7 @@ def test_what_raises(float64):
         refiltering.step(refiltering.start(rows[0]), rows[1].copy().update({"is_init": torch.ones(B, 1).bool()}))
 
 
-def test_a_dictionary_is_a_row_of_one_robot(float64):
+def test_step_accepts_a_dictionary(float64):
     filter, frames = fused("Kalman"), arriving(readings(), PATTERNS["out of order"])[0]
     refiltering = Refiltering(filter, LATE, DELAY)
     window = refiltering.start({})
@@ -185,7 +185,7 @@ def test_a_dictionary_is_a_row_of_one_robot(float64):
     assert_close(window.belief["belief", "mean"], expected["belief", "mean"][-1], rtol=0, atol=0)
 
 
-def test_what_stands_around_a_filter_goes_inside(float64):
+def test_wrappers_around_refiltering_raise(float64):
     monitor = InnovationMonitor({"second": MonitoredSensor("info", 1)})
     refiltering = Refiltering(fused("Kalman"), LATE, DELAY)
     for wrap in (Gated, lambda filter: Monitored(filter, monitor)):
@@ -199,17 +199,15 @@ def test_two_sensors_late_in_one_row_and_a_late_entry_without_a_reading(float64)
     for name in ("first", "second"):
         frames[f"{name}_observed"][:] = True
     order, rows = frames.clone(), frames.clone()
-    late = {"first": 3, "second": 1}  # at t = 7; nothing was read at the times that they belong to
+    late = {"first": 3, "second": 1}  # arrive at t = 7; no other reading at the times of their stamps
     for name, steps in late.items():
         rows[f"{name}_late"] = torch.zeros(B, T, 1, dtype=torch.int64)
         rows[f"{name}_late"][:, 7] = steps
         rows[name][:, 7], rows[f"{name}_observed"][:, 7 - steps] = frames[name][:, 7 - steps], False
         order[f"{name}_observed"][:, 7] = False
-    rows["first_late"][:, 9], rows["first_observed"][:, 9] = (
-        2,
-        False,
-    )  # says nothing: t = 7 has no reading, t = 9 neither
-    rows["second_late"][:, 9], rows["second_observed"][:, 9] = 1, False  # t = 8 keeps its own
+    # A delay without a reading changes nothing: t = 7 stays without one, t = 8 keeps its own.
+    rows["first_late"][:, 9], rows["first_observed"][:, 9] = 2, False
+    rows["second_late"][:, 9], rows["second_observed"][:, 9] = 1, False
     for name in late:
         order[f"{name}_observed"][:, 9] = False
     keys = {f"{name}_late": (name, f"{name}_observed") for name in late}

@@ -118,7 +118,7 @@ def test_an_innovation_of_angles_is_the_shorter_way_round(float64, kind, samples
     assert_close(network.given[0]["compass"], expected.expand(1), rtol=0, atol=1e-9)
 
 
-def test_a_late_reading_is_judged_by_what_is_believed_of_its_time(float64):
+def test_late_innovation_uses_the_belief_of_its_time(float64):
     F, Q, H, R = linear_system()
     network = Constant(1.0, 1.0)
     rows = frames()
@@ -137,7 +137,7 @@ def test_a_late_reading_is_judged_by_what_is_believed_of_its_time(float64):
     assert observed.all()
 
 
-def test_what_is_not_observed_is_not_looked_at_and_weights_have_a_floor(float64):
+def test_missing_readings_are_ignored_and_weights_have_a_floor(float64):
     torch.manual_seed(0)
     attention = SensorAttention({"a": 2, "b": 1}, features={"b": 3}, floor=0.1)
     values = {"a": torch.randn(5, 2), "b": torch.randn(5, 1)}

@@ -59,7 +59,7 @@ def test_a_gate_counts_no_reading_of_the_time_before_an_episode(float64):
     assert not out["gate_second", "log_noise"][:, :3].any()
 
 
-def test_a_gate_of_a_joint_update_counts_what_each_mask_shows(float64):
+def test_gate_of_a_joint_update_counts_observed_components(float64):
     frames = readings(2, 8)
     out = Gated(fused(joint=True), 2, window=20).sequence(frames.copy())
     seen = frames["first_observed"].long() + frames["second_observed"]
@@ -67,7 +67,7 @@ def test_a_gate_of_a_joint_update_counts_what_each_mask_shows(float64):
     assert torch.equal(out["gate", "terms"][..., 0, 1].sum(-1), seen.cumsum(1).squeeze(-1).double())
 
 
-def test_a_monitor_of_a_joint_update_counts_what_each_mask_shows(float64):
+def test_monitor_of_a_joint_update_counts_observed_components(float64):
     frames = readings(2, 8)
     monitor = InnovationMonitor({"both": MonitoredSensor("info", 2)}, window=20)
     terms = Monitored(fused(joint=True), monitor).sequence(frames.copy())["monitor", "both", "terms"]
@@ -118,7 +118,7 @@ def test_another_number_of_components_than_the_reading_has_raises(told):
             filter.sequence(readings(2, 4))
 
 
-def test_a_gate_knows_the_size_of_a_joint_reading(float64):
+def test_gate_infers_the_dimension_of_a_joint_reading(float64):
     told, found = (Gated(fused(joint=True), *dim).sequence(readings(2, 9)) for dim in ((2,), ()))
     assert (told["gate", "factor"] > 1).any()
     assert_close(found["belief", "mean"], told["belief", "mean"], rtol=0, atol=0)
@@ -155,7 +155,7 @@ def test_two_analyses_in_one_place_have_gates_of_their_own(float64):
     assert_close(out["belief", "mean"], expected["belief", "mean"])
 
 
-def test_a_package_hands_its_code_entries_as_they_lay_in_the_example():
+def test_package_inputs_are_made_contiguous():
     signature = {"inputs": [("x", [2, 3], "torch.float32")], "outputs": ["y"], "carry": []}
     step = PackagedStep(lambda x: (torch.tensor(x.stride()),), signature)
     assert step({"x": torch.ones(3, 2).mT})["y"].tolist() == [3, 1]

@@ -1,4 +1,4 @@
-"""Writes the golden values anew: ``python -m tests.golden``. The commit that changes one says why."""
+"""Writes the golden values again: ``python -m tests.golden``. The commit that changes one says why."""
 
 import json
 

@@ -48,7 +48,7 @@ MEAN, VAR = ("belief", "mean"), ("belief", "var")
 
 
 def values() -> dict[str, list[float]]:
-    """All golden values, by name."""
+    """Returns all golden values, by name."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
@@ -59,12 +59,12 @@ def values() -> dict[str, list[float]]:
 
 
 def numbers(*parts: Tensor) -> list[float]:
-    """The numbers of some tensors, one after the other."""
+    """Returns the numbers of some tensors, one after the other."""
     return [float(f"{value:.12g}") for part in parts for value in part.detach().double().flatten()]
 
 
 def of_filters() -> dict[str, list[float]]:
-    """The last belief of a sequence, and that of one more step."""
+    """Returns the last belief of a sequence, and that of one more step."""
     out = {}
     for name, make in FILTERS.items():
         torch.manual_seed(1)
@@ -82,7 +82,7 @@ def of_filters() -> dict[str, list[float]]:
 
 
 def of_smoothers() -> dict[str, list[float]]:
-    """The smoothed means of a sequence."""
+    """Returns the smoothed means of a sequence."""
     torch.manual_seed(5)
     frames = TensorDict({"observation": torch.randn(2, 6, 2)}, [2, 6])
     plain = linear_denkf()
@@ -121,7 +121,7 @@ def moved_particles() -> ParticleFilter:
 
 
 def of_losses() -> dict[str, list[float]]:
-    """Each term, and the norm of its gradient."""
+    """Returns each term, and the norm of its gradient."""
     torch.manual_seed(7)
     frames = TensorDict({"observation": torch.randn(3, 5, 2), "state": torch.randn(3, 5, 2)}, [3, 5])
     rich = toy_frames((3, 5), resets=False).set("state", torch.randn(3, 5, 3))
@@ -170,7 +170,7 @@ def of_monitors() -> dict[str, list[float]]:
 
 
 def of_weights() -> dict[str, list[float]]:
-    """The filters that come with the library, on random readings; the car's on a rendered drive that fails, too."""
+    """Runs the pretrained filters on random readings; the car's also on a rendered drive with faults."""
     out = {f"weights: {name}": found for name, found in all_beliefs().items()}
     with tempfile.TemporaryDirectory() as folder:
         render_drives(Path(folder), names="drive", frames=30, size=(100, 300), seed=2032)
@@ -191,7 +191,7 @@ def of_studies() -> dict[str, list[float]]:
 
 
 def of_chaotic_systems() -> dict[str, list[float]]:
-    """Errors of smoothers, and of the schemes on a truth of few cycles: chaos would make rounding visible."""
+    """Returns errors of smoothers, and of the schemes on a truth of few cycles: chaos would make rounding visible."""
     out = {}
     for case in CASES:
         rows = smoothing.rows(case, [0, 1], cycles=26)
@@ -211,7 +211,7 @@ def of_chaotic_systems() -> dict[str, list[float]]:
 
 
 def of_fusion_and_odometry() -> dict[str, list[float]]:
-    """Errors of fused sensors before any training, and of the path of a rendered drive."""
+    """Returns errors of fused sensors before any training, and of the path of a rendered drive."""
     torch.set_default_dtype(torch.float32)
     torch.manual_seed(11)
     task = fusion.arm_task(demos=(2, 2), steps=3)

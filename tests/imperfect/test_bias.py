@@ -28,7 +28,7 @@ STD, TIME = [0.8, 0.5], [3.0, 20.0]  # of a fast bias and a slow one, of the sam
 
 
 def motion():
-    """A place and its rate."""
+    """Returns a place and its rate."""
     network = torch.nn.Linear(2, 2, bias=False).double()
     network.weight.data = torch.tensor([[1.0, 1.0], [0.0, 1.0]], dtype=torch.double)
     return LearnedTransition(network.requires_grad_(False), residual=False)
@@ -44,7 +44,7 @@ def parts():
 
 
 def simulate(seed=0):
-    """True places ``[T]`` and readings ``[T]`` with coloured errors."""
+    """Returns true places ``[T]`` and readings ``[T]`` with coloured errors."""
     rng = np.random.default_rng(seed)
     decay = np.exp(-1 / np.array(TIME))
     place, rate, bias, places, readings = 0.0, 0.0, np.array(STD) * rng.normal(size=2), [], []
@@ -57,7 +57,7 @@ def simulate(seed=0):
 
 
 def augmented_kalman_filter(readings, start):
-    """Means ``[T, 4]`` and covariances ``[T, 4, 4]``; the first is the start."""
+    """Returns means ``[T, 4]`` and covariances ``[T, 4, 4]``; the first is the start."""
     decay = np.exp(-1 / np.array(TIME))
     f = np.zeros((4, 4))
     f[:2, :2], f[2:, 2:] = [[1, 1], [0, 1]], np.diag(decay)
@@ -76,14 +76,14 @@ def augmented_kalman_filter(readings, start):
 START = [0.1, 0.1, *STD]
 
 
-def beside_the_oracle(filter):
-    """Returns what a filter makes of the readings, and the means and covariances that are right."""
+def with_oracle(filter):
+    """Returns a filter's belief, and the oracle's means and covariances."""
     readings = simulate()[1]
     out = filter.sequence(TensorDict({"reading": torch.tensor(readings).unsqueeze(-1)}, [STEPS]))
     return out, *map(torch.tensor, augmented_kalman_filter(readings, START))
 
 
-def test_biases_stay_as_large_and_are_correlated_as_said():
+def test_stationary_variance_and_time_constant():
     bias = FadingBias(torch.tensor([2.0, 0.5]), [4.0, 30.0])
     torch.testing.assert_close(bias.decay**2 * bias.std**2 + bias.variance, bias.std**2)
     torch.testing.assert_close(bias.decay**10, torch.exp(-10 / torch.tensor([4.0, 30.0])))
@@ -91,8 +91,8 @@ def test_biases_stay_as_large_and_are_correlated_as_said():
     torch.testing.assert_close(very_slow.variance, torch.tensor([2e-9]))  # no digits are lost
 
 
-def test_a_likelihood_learns_size_and_time():
-    """At the true values the slope of the readings' likelihood is zero but for chance: on many runs it is small."""
+def test_likelihood_is_maximal_at_the_true_size_and_time():
+    """At the true values the slope of the readings' likelihood is zero on average: on many runs it is small."""
     _, transition, q, observation, r = parts()
     bias = FadingBias(torch.tensor(STD, dtype=torch.double), TIME)
     for part in (transition, q, observation):
@@ -117,7 +117,7 @@ def test_a_likelihood_learns_size_and_time():
     assert log_likelihood().mean() < likelihood.mean()
 
 
-def test_a_covariance_of_the_state_gets_the_biases_in_its_corner():
+def test_bias_block_of_the_covariance():
     bias = FadingBias([2.0], time=5.0, trainable=False)
     inner = CholeskyNoise(2, r=[0.1, 1.0], in_features=3, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     q = BiasedNoise(inner, bias)(TensorDict({("belief", "mean"): torch.zeros(4, 3)}, [4]))["forecast", "noise"]
@@ -134,7 +134,7 @@ def test_each_component_gets_its_biases():
     torch.testing.assert_close(read["forecast", "observation"], torch.tensor([[1.02, 2.31]]))
 
 
-def test_what_cannot_be_raises():
+def test_invalid_arguments_raise():
     with pytest.raises(ValueError, match="time, in steps"):
         FadingBias([1.0], time=0.0)
     with pytest.raises(ValueError, match="2 components of the reading, and there are 1"):
@@ -179,7 +179,7 @@ def test_the_option_is_the_augmented_kalman_filter(kind):
         r = ConstantNoise(torch.tensor([R], dtype=torch.double), in_key="reading")
         options = {"process_noise": q, "initial": initial, "observation_key": "reading", "sensor_error": known_bias()}
         filter = kind(motion(), None, Select([0]), r, **options)
-    out, mean, cov = beside_the_oracle(filter)
+    out, mean, cov = with_oracle(filter)
     torch.testing.assert_close(out["belief", "mean"], mean, atol=1e-9, rtol=1e-7)
     torch.testing.assert_close(out["belief", "cov"], cov, atol=1e-9, rtol=1e-7)
 
@@ -195,7 +195,7 @@ def test_the_option_of_an_ensemble_comes_close_to_it(own):
     noise = ConstantNoise(q, in_key=("belief", "mean"), out_key=("forecast", "noise"))
     moves = NoisyTransition(motion(), noise) if own else motion()
     options = {"initial": initial, "sensor_error": known_bias(), "process_noise": None if own else q}
-    out, mean, cov = beside_the_oracle(DEnKF(moves, None, Select([0]), r, analysis, **options))
+    out, mean, cov = with_oracle(DEnKF(moves, None, Select([0]), r, analysis, **options))
     std = cov.diagonal(dim1=1, dim2=2).sqrt()
     assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.08  # members say it to 0.7 % a step
     assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.05
@@ -214,12 +214,12 @@ def test_the_option_of_particles_comes_close_to_it():
         sensor_error=known_bias(),
         observation_key="reading",
     )
-    out, mean, cov = beside_the_oracle(particles)
+    out, mean, cov = with_oracle(particles)
     std = cov.diagonal(dim1=1, dim2=2).sqrt()
     assert ((out["belief", "mean"] - mean).abs() / std).max() < 0.1
     assert (out["belief", "var"].sqrt() / std - 1).abs().max() < 0.1
     moved = particles["transition"]
-    with pytest.raises(ValueError, match="ResampledTransition holds its motion"):
+    with pytest.raises(ValueError, match="motion inside the ResampledTransition"):
         ParticleFilter(moved, None, Select([0]), initial=particles.initial, sensor_error=known_bias())
 
 
@@ -239,7 +239,7 @@ def test_the_option_of_an_iterated_smoother_is_its_parts():
         linear_filter("BackpropKF", sensor_error=known_bias())
 
 
-def test_errors_of_a_factor():
+def test_scale_errors():
     state = torch.tensor([[2.0, 4.0, 0.1, -0.5]])
     td = TensorDict({("forecast", "ensemble"): state}, [])
     read = BiasedObservation(Select([0, 1]), FadingBias([1.0] * 2, time=2.0, factor=True))(td)
@@ -251,7 +251,7 @@ def test_errors_of_a_factor():
 
 
 def residuals(runs, steps, *, std=(2.0, 0.5), time=(10.0, 3.0), white=(0.5, 1.0), seed=0):
-    """AR(1) and white noise, begun in its long run."""
+    """Returns stationary AR(1) noise plus white noise."""
     rng, decay = np.random.default_rng(seed), np.exp(-1 / np.array(time))
     bias, rows = np.array(std) * rng.normal(size=(runs, 2)), []
     for _ in range(steps):
@@ -261,7 +261,7 @@ def residuals(runs, steps, *, std=(2.0, 0.5), time=(10.0, 3.0), white=(0.5, 1.0)
 
 
 @pytest.mark.parametrize("gaps", [False, True])
-def test_residuals_tell_size_and_time(gaps):
+def test_size_and_time_constant_from_residuals(gaps):
     """400 runs of 100 steps hold N T / (2 time) = 2,000 and 6,700 draws of the biases apart from each other: their
 
     variances are known to sqrt(2 / 2000) = 3 %, standard deviations to 1.6 %, and times, a ratio of two such, to about
@@ -278,15 +278,15 @@ def test_residuals_tell_size_and_time(gaps):
     assert white.tolist() == pytest.approx([0.5, 1.0], rel=0.06)
 
 
-def test_errors_of_a_whole_run_beside_those_that_fade():
+def test_constant_and_fading_biases_together():
     """400 draws of a run's error: its standard deviation is known to 3.5 %; the others as above."""
     values = residuals(400, 100) + torch.tensor(np.random.default_rng(1).normal(size=(400, 1, 2)) * [1.5, 1.0])
-    values[0] = torch.nan  # a run of which nothing is known
+    values[0] = torch.nan  # a run without observations
     values[torch.rand(400, 100, generator=torch.Generator().manual_seed(0)) < 0.3] = torch.nan
     bias, white = FadingBias.from_residuals(values, per_run=True)
     assert bias.std.tolist() == pytest.approx([1.5, 1.0, 2.0, 0.5], rel=0.12)
     assert bias.log_time.exp().tolist() == pytest.approx([1e4, 1e4, 10.0, 3.0], rel=0.25)
-    assert white.tolist() == pytest.approx([0.5, 1.0], abs=0.15)  # what is left of a covariance of 6.5
+    assert white.tolist() == pytest.approx([0.5, 1.0], abs=0.15)  # residual of a covariance of 6.5
     one = FadingBias.from_residuals(values)[0]
     assert (one.log_time.exp() > 20).all()  # one time for both kinds fits neither
 

@@ -109,7 +109,7 @@ def late_on_space(kind):
 
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "etkf", "particles", "late EKF", "late etkf"])
 def test_orientations_turn_with_the_world_and_steps_are_the_sequence(float64, kind):
-    """Readings of which a share is wrong: a world that is turned changes nothing else, a past included."""
+    """Readings of which a share is wrong: a world that is turned changes nothing else, a lag window included."""
     divergence = 0.0 if kind == "particles" else 0.1
     filter = (
         late_on_space(kind.split()[-1])

@@ -15,7 +15,7 @@ def cov(members):
 
 
 def updated(size, dim, *, dtype=torch.float64, seed=0):
-    """Members, and what an update in their own span leaves of them: shrunk, turned a little and moved."""
+    """Returns members, and what an update in their own span leaves of them: shrunk, turned a little and moved."""
     torch.manual_seed(seed)
     before = torch.randn(2, size, dim, dtype=dtype)
     before[..., 1] = 3 * before[..., 0]  # known together
@@ -48,7 +48,7 @@ def test_a_share_of_one_and_of_zero(dtype):
         assert_close(mixed, expected, rtol=0, atol=30 * torch.finfo(dtype).eps)
 
 
-def test_what_stands_behind_moves_nothing_in_front():
+def test_further_components_do_not_change_the_first():
     after, before = updated(7, 9)
     share = torch.tensor([[0.4], [0.7]], dtype=torch.float64)
     assert_close(

@@ -1,4 +1,4 @@
-"""Filters that heed whether a sensor sees: every way to run one is the same, and certain knowledge is a mask."""
+"""Filters that use whether a sensor sees: every way to run one is the same, and certain knowledge is a mask."""
 
 from functools import partial
 
@@ -46,12 +46,12 @@ CERTAIN = [name for name in MAKERS if name != "particles"]  # these resample whe
 
 
 def heeds(filter):
-    """The filter, whose update heeds p from the data."""
+    """Returns the filter, whose update uses p from the data."""
     return filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
 
 
 def contaminated(filter, share="visible", **options):
-    """The filter, whose readings are wrong in the share that an entry says."""
+    """Returns the filter, whose readings are wrong in the share that an entry says."""
     return filter.with_modules(analysis=Contaminated(filter["analysis"], share, **options))
 
 
@@ -61,7 +61,7 @@ BOTH = pytest.mark.parametrize("share", WRAPPED)
 
 
 def frames(*batch):
-    """Readings, masks, starts and p."""
+    """Returns readings, masks, resets and p."""
     torch.manual_seed(0)
     td = TensorDict({"observation": torch.randn(*batch, 2), "visible": torch.rand(*batch, 1)}, batch)
     td["observed"] = torch.rand(*batch, 2) < 0.8
@@ -112,7 +112,7 @@ def test_a_packaged_step_is_the_step(name, share, tmp_path):
 
 
 def certain(td, key="observed"):
-    """Readings that are seen for certain, or for certain not; and the same by masks."""
+    """Returns readings that are seen for certain, or for certain not; and the same by masks."""
     sees = torch.rand(*td.batch_size, 1) < 0.6
     return td.copy().set("visible", sees.to(torch.float64)), td.copy().set(key, td[key] & sees)
 
@@ -138,7 +138,7 @@ KINDS = {"ensemble": partial(EnsembleAnalysis, "etkf"), "EKF": EKFAnalysis, "UKF
 
 
 def late(kind, r=1.0, *, analysis=None, delay=2):
-    """A filter of a sensor that is late, and of one that is not."""
+    """Returns a filter of a sensor that is late, and of one that is not."""
     F, Q, H, R = linear_system()
     sensors = {
         "late": FusedSensor(LinearObservation(H), r * R.sqrt(), delay=delay, analysis=analysis),
@@ -154,7 +154,7 @@ def late(kind, r=1.0, *, analysis=None, delay=2):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("delay", [0, 2])
-def test_late_readings_of_which_it_is_certain(float64, kind, delay):
+def test_late_readings_with_certain_visibility(float64, kind, delay):
     td = frames(2, 9).rename_key_("observation", "late").rename_key_("observed", "late_observed")
     td["own"], td["own_observed"] = torch.randn(2, 9, 2), torch.rand(2, 9, 1) < 0.5
     told, masked = certain(td, "late_observed")
@@ -165,7 +165,7 @@ def test_late_readings_of_which_it_is_certain(float64, kind, delay):
         assert_close(out[key], expected[key], rtol=0, atol=1e-9)
 
 
-def test_a_past_and_the_present_have_the_moments_of_one_mixture(float64):
+def test_clones_and_present_share_one_mixture(float64):
     """The ensemble smoother's members of both, side by side; the present is the filter's own."""
     torch.manual_seed(0)
     members, analysis = torch.randn(12, 3), EnsembleAnalysis("etkf", observation_key="reading")
@@ -187,12 +187,12 @@ def test_a_past_and_the_present_have_the_moments_of_one_mixture(float64):
 
 @BOTH
 @pytest.mark.parametrize(("make", "smoother"), [(linear_denkf, EnRTS), (linear_kalman, RTSSmoother)])
-def test_smoothers_run_behind_it(float64, make, smoother, share):
+def test_smoothers_with_visibility(float64, make, smoother, share):
     out = smoother(WRAPPED[share](make()))(frames(2, 8))
     assert_close(out["smoothed", "mean"][:, -1], out["belief", "mean"][:, -1])
 
 
-def test_a_gate_does_not_go_around_it_for_particles():
+def test_gate_around_visibility_raises_for_particles():
     with pytest.raises(TypeError, match="no analysis that a gate goes around"):
         Gated(heeds(bootstrap(50)), 2)
 
@@ -201,7 +201,7 @@ def test_a_gate_does_not_go_around_it_for_particles():
 
 
 def learned(kind):
-    """A filter of two components; its sensor's reading tells half of what the head must know."""
+    """Returns a filter of two components; its sensor's reading tells half of what the head must know."""
     F, _, H, _ = linear_system()
     moves = torch.nn.Linear(2, 2, bias=False)
     moves.weight.data = F.clone()

@@ -41,7 +41,7 @@ def test_ensemble_interval_of_a_calibrated_ensemble(members, level):
     assert abs(share - level) < 5 * (level * (1 - level) / n) ** 0.5 + slack
 
 
-def test_errors_say_what_to_do():
+def test_invalid_input_raises():
     mean = torch.zeros(4, 2)
     with pytest.raises(ValueError, match=r"18 members span 17/19 of their distribution; level 0\.9 needs more"):
         ensemble_interval_coverage(torch.zeros(4, 18, 2), mean)

@@ -66,7 +66,7 @@ def test_sample_covariances_give_the_mean_of_the_docstring():
     assert expected > 1.2 * dims  # the plain S would be far off
 
 
-def test_errors_say_what_to_do():
+def test_invalid_input_raises():
     mean = torch.zeros(4, 3)
     assert_raises(ValueError, r"\[4, 3, 3\], or variances .* got \[3, 3\]", nees, mean, torch.eye(3), mean)
     few = torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(0))[:, :2]

@@ -66,9 +66,9 @@ def test_a_belief_that_is_nan_is_not_left_out(metric):
     assert METRICS[metric](ensemble, gaps).isnan().tolist() == [True, False]
 
 
-def test_what_needs_whole_rows_says_so():
+def test_metrics_of_complete_rows_raise_on_gaps():
     ensemble, truth, gaps, _ = problem()
-    assert_raises(ValueError, r"truth is NaN in places.*leave out", nees, ensemble.mean(-2), ensemble.var(-2), gaps)
+    assert_raises(ValueError, r"truth is NaN, unknown.*leave out", nees, ensemble.mean(-2), ensemble.var(-2), gaps)
     assert_raises(ValueError, "leave out the rows", rank_histogram, ensemble, gaps)
     with pytest.raises(ValueError, match="bins need at least one state each; got 0 states"):
         spread_error(ensemble.mean(-2), ensemble.var(-2), truth * torch.nan, bins=2)

@@ -99,7 +99,7 @@ def test_band_holds_all_bars_of_calibrated_histograms_together():
     assert histogram_band(7, 1) == (7, 7)
 
 
-def test_spread_error_by_hand_and_beside_the_ratio():
+def test_spread_error_by_hand_and_against_the_ratio():
     error = torch.randn(600, 2, generator=rng(), dtype=torch.float64)
     std = torch.rand(600, 2, generator=rng(1), dtype=torch.float64) + 0.5
     truth = torch.zeros_like(std)
@@ -122,7 +122,7 @@ def test_interval_is_numpys_quantile(level):
     np.testing.assert_allclose([low.numpy(), high.numpy()], expected, atol=1e-12)
 
 
-def test_errors_say_what_to_do():
+def test_invalid_input_raises():
     ones = torch.ones(4, 2)
     assert_raises(ValueError, "cannot be negative", pit, ones, -ones, ones)
     assert_raises(ValueError, "must be finite", rank_histogram, torch.full((4, 3, 2), torch.nan), ones)

@@ -12,7 +12,7 @@ from torch_denkf.metrics import state_errors
 from torch_denkf.metrics.state import state_difference
 
 
-def test_by_hand():
+def test_errors_equal_values_by_hand():
     truth = torch.tensor([[[0.0, 3.0, 1.0], [0.0, -3.0, 1.0]]], dtype=torch.float64)
     estimated = torch.tensor([[[3.0, -3.0, 1.0], [-1.0, -2.5, 1.0]]], dtype=torch.float64)
     turn = 2 * math.pi - 6  # from 3 to -3 rad, to the left
@@ -47,7 +47,7 @@ def test_gradients_go_through_wrapped_angles():
     torch.testing.assert_close(estimated.grad, torch.tensor([[2.0, 2 * (6 - 2 * math.pi)]]).double())
 
 
-def test_errors_say_what_to_do():
+def test_invalid_input_raises():
     assert_raises(ValueError, "for ensembles pass the mean", state_errors, torch.zeros(4, 8, 3), torch.zeros(4, 3))
     with pytest.raises(ValueError, match="point has shape"):
         state_errors(torch.zeros(4, 3), torch.zeros(4, 3), space=Circle())

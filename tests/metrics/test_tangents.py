@@ -28,7 +28,7 @@ def _double(float64):
 
 
 def belief(space, center, factor):
-    """Truth, mean, members, weights, variance and covariance around a point, [COUNT, ...]."""
+    """Returns the truth, mean, members, weights, variance and covariance around a point, [COUNT, ...]."""
 
     def around(*extra):
         point = center.expand(COUNT, *extra, space.point_dim)
@@ -60,7 +60,7 @@ RATIO = {"ratio": lambda b, **o: spread_skill_ratio(b["mean"], b["var"], b["trut
 
 
 @pytest.mark.parametrize("name", METRICS)
-def test_angles_and_numbers_are_measured_as_they_were(name):
+def test_angles_and_numbers_equal_the_plain_metrics(name):
     found = belief(Product(Circle(), Euclidean(2)), torch.tensor([math.pi - 0.05, 1.0, -2.0]), 0.4 * torch.eye(3))
     expected = METRICS[name](found, space=Product(Circle(), Euclidean(2)))
     assert not torch.allclose(METRICS[name](found), expected), "it is no plain number"

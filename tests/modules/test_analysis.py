@@ -79,7 +79,7 @@ def test_rotation_given_and_drawn(float64):
     assert not drawn.allclose(plain)
 
 
-def test_inflation_multiplies_the_components_that_it_is_told(float64):
+def test_inflation_multiplies_the_given_components(float64):
     td = inputs()
     plain = EnsembleAnalysis("sensor")(td.clone())["belief"]
     some = EnsembleAnalysis("sensor", inflation=1.5, inflated=[1, 2])(td.clone())["belief"]

@@ -26,17 +26,17 @@ BELIEF = [("belief", name) for name in ("ensemble", "mean", "var")]
 
 
 def wrapped(value):
-    """The first component, between -pi and pi."""
+    """Returns the first component, between -pi and pi."""
     return torch.cat([torch.atan2(value[..., :1].sin(), value[..., :1].cos()), value[..., 1:]], -1)
 
 
 def turned(value):
-    """The first component, turned by half a circle."""
+    """Returns the first component, turned by half a circle."""
     return wrapped(value - torch.tensor([math.pi, 0.0]))
 
 
 def ensembles(batch, samples):
-    """Headings around 3.1, read around -3.1; and the same problem, turned."""
+    """Returns headings around 3.1, read around -3.1; and the same problem, turned."""
     forecast = 0.3 * torch.randn(*batch, E, S)
     center = torch.tensor([3.1, 1.0])
     predicted = wrapped(forecast[..., :OBS] + center)
@@ -69,7 +69,7 @@ def test_ensemble_analysis(scheme, samples, batch):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_ensemble_analysis_of_what_is_observed(scheme):
+def test_ensemble_analysis_of_observed_components(scheme):
     here, there = ensembles((3,), True)
     for td in (here, there):
         td["observed"] = torch.tensor([[True, True], [False, True], [False, False]])

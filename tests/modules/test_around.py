@@ -18,7 +18,7 @@ from torch_denkf.smoothers.past import LaggedAnalysis, lagged
 from torch_denkf.submodel import Call
 
 E, S, WIDTH = 6, 2, 2
-OWN = {"updates_ensemble", "aligned", "on_aligned"}  # of what goes around, a past and angles know nothing
+OWN = {"updates_ensemble", "aligned", "on_aligned"}  # of what goes around, a lag window and angles know nothing
 
 
 class ScaledInnovation(Around):
@@ -69,7 +69,7 @@ UPDATES = {
 
 
 @pytest.mark.parametrize("name", UPDATES)
-def test_what_goes_around_passes_on_all_that_the_update_declares(name):
+def test_wrapper_passes_on_all_declarations(name):
     inside = UPDATES[name]()
     declared = {key for key in vars(Update) if not key.startswith("_")} - OWN
     assert {"reading_keys", "observed_key", "space", "reading_dims", "with_mask", "info_prefix"} <= declared
@@ -109,8 +109,8 @@ def test_entries_that_are_aligned_go_through_the_wrapper_all_the_same():
 
 
 @pytest.mark.parametrize("name", ["lagged", "visible, lagged"])
-def test_a_lag_goes_inside_of_what_goes_around(name):
-    """The past is corrected by what the wrapper makes of the reading."""
+def test_lag_is_applied_inside_wrappers(name):
+    """The lag window is corrected by what the wrapper makes of the reading."""
     plain = EnsembleAnalysis("etkf") if name == "lagged" else Visible(EnsembleAnalysis("etkf"))
     around = lagged(ScaledInnovation(plain, 0.5))
     assert isinstance(around, ScaledInnovation)
@@ -119,14 +119,14 @@ def test_a_lag_goes_inside_of_what_goes_around(name):
     changed = td.copy().set(("sensor", "ensemble"), around.scaled(dict(td.items(True, True)), Call(td.batch_size)))
     expected = UPDATES[name]()(changed).set(("sensor", "ensemble"), td["sensor", "ensemble"])
     assert_equal(around(td), expected)
-    with pytest.raises(TypeError, match="ScaledInnovation does not say what a reading means for earlier states"):
+    with pytest.raises(TypeError, match="ScaledInnovation cannot correct earlier states"):
         LaggedAnalysis(ScaledInnovation(plain, 0.5))
     with pytest.raises(TypeError, match="ScaledInnovation does not say"):
         GatedAnalysis(ScaledInnovation(plain, 0.5), WIDTH)
 
 
 def test_a_wrapper_in_a_filter_and_in_its_fixed_lag(float64):
-    """A share of 1 changes nothing but for rounding, in a step, in a sequence and with a lag; noise keeps its place."""
+    """A share of 1 changes nothing up to rounding, in a step, in a sequence and with a lag; noise keeps its place."""
     _, _, H, _ = linear_system()
     frames = TensorDict({"observation": torch.randn(3, 6, len(H)), "observed": torch.rand(3, 6, 1) < 0.8}, [3, 6])
     plain, around = linear_denkf("perturbed"), linear_denkf("perturbed")

@@ -64,7 +64,7 @@ class TestFromSensor:
         std = torch.stack([variance[..., 1].sqrt(), 0.2 * one, variance[..., 0].sqrt()], -1)
         assert_moments(td, mean, std)
 
-    def test_nothing_observed_is_the_prior(self, float64):
+    def test_without_observation_the_belief_is_the_prior(self, float64):
         nan = torch.full((2,), torch.nan)
         td = TensorDict({"sensor": {"ensemble": nan, "noise": torch.ones(2)}, "observed": torch.tensor([False])})
         assert_moments(self.start()(td), self.mean, self.std)
@@ -78,7 +78,7 @@ class TestFromSensor:
         )
         assert_moments(self.start()(td), torch.tensor([1.0, 2.0, 9.0]), torch.tensor([0.1, 0.2, 2.0]))
 
-    def test_a_filter_whose_start_lacks_its_reading_says_so(self):
+    def test_initial_belief_without_its_reading_raises(self):
         start = FromSensor([0], [0.0, 0.0], [1.0, 1.0], ensemble_size=6, observation_key="readng")
         frames = TensorDict({"observation": torch.zeros(2, 3, 2), ("sensor", "noise"): torch.ones(2, 3, 1)}, [2, 3])
         filter = linear_denkf(initial=start)

@@ -117,7 +117,7 @@ def test_the_jacobian_has_a_gradient_unless_it_is_stopped(float64):
 @pytest.mark.parametrize("layer", [nn.Dropout(), FlipoutLinear(3, 3)])
 def test_random_layers_raise(Transition, layer):
     random = LearnedTransition(nn.Sequential(nn.Linear(3, 3), layer))
-    with pytest.raises(ValueError, match=r"deterministic model; LearnedTransition holds random parts \(\['module.1'\]"):
+    with pytest.raises(ValueError, match=r"deterministic model; LearnedTransition has random parts \(\['module.1'\]"):
         Transition(random, constant_noise(3))
 
 
@@ -134,7 +134,7 @@ def test_random_observation_models_raise_or_made_deterministic(Analysis):
 def test_sub_models_that_draw_their_own_noise_raise(Transition):
     matrix, state = torch.eye(3), torch.get_rng_state()
     noisy = NoisyLinear(matrix, matrix)
-    with pytest.raises(ValueError, match=r"NoisyLinear holds random parts \(\['NoisyLinear'\]"):
+    with pytest.raises(ValueError, match=r"NoisyLinear has random parts \(\['NoisyLinear'\]"):
         Transition(noisy, constant_noise(3))
     assert torch.get_rng_state().equal(state)
     Transition(NoisyLinear(matrix), constant_noise(3))
@@ -260,7 +260,7 @@ def test_an_error_in_a_jacobian_is_raised(error, wrapped):
         EKFAnalysis(model)(td)
 
 
-def test_a_sensor_without_errors_beside_one_that_has_some_knows_its_jacobian():
+def test_jacobian_of_an_unbiased_sensor_next_to_a_biased_one():
     model = OfOwnErrors(Select([1]), [], 1)
     states = torch.randn(4, 1, 3)
     _, jacobian, _ = linearise(model, {("forecast", "ensemble"): states}, Call(torch.Size([4])))

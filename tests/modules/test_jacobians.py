@@ -135,7 +135,7 @@ def moving(transition, size, **options):
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
 @pytest.mark.parametrize("name", TRANSITIONS)
-def test_a_transition_knows_its_jacobian_and_its_gradient(float64, monkeypatch, name, batch):
+def test_jacobian_of_a_transition_and_its_gradient(float64, monkeypatch, name, batch):
     transition = TRANSITIONS[name]()
     td = entries(3, *batch, action=torch.randn(*batch, 2), dt=torch.rand(*batch, 1))
     both = known_and_differentiated(monkeypatch, moving(transition, 3), td, parameters=list(transition.parameters()))
@@ -143,7 +143,7 @@ def test_a_transition_knows_its_jacobian_and_its_gradient(float64, monkeypatch, 
 
 
 def reading(name, *batch, kind=EKFAnalysis):
-    """An update of an observation, and what it reads."""
+    """Returns an update of an observation, and what it reads."""
     observation = OBSERVATIONS[name]()
     size = {"errors of others": 6}.get(name, 3)
     outputs = {"select": 3, "biased": 1, "biased factor": 2}.get(name, 2)
@@ -155,7 +155,7 @@ def reading(name, *batch, kind=EKFAnalysis):
 
 @pytest.mark.parametrize("batch", [(), (4,)])
 @pytest.mark.parametrize("name", OBSERVATIONS)
-def test_an_observation_knows_its_jacobian_and_its_gradient(float64, monkeypatch, name, batch):
+def test_jacobian_of_an_observation_and_its_gradient(float64, monkeypatch, name, batch):
     update, td = reading(name, *batch)
     both = known_and_differentiated(monkeypatch, update, td, parameters=list(update.parameters()))
     assert_close(*both, rtol=1e-10, atol=1e-10)
@@ -214,7 +214,7 @@ def test_chains_keep_their_precision(name, dtype):
     assert_close(jacobian, torch.func.vmap(torch.func.jacrev(network))(x), rtol=tolerance, atol=tolerance)
 
 
-def test_what_a_chain_does_not_know_is_differentiated():
+def test_unknown_jacobians_in_a_chain_are_differentiated():
     x = torch.zeros(1, 3)
     others = [nn.LayerNorm(3), nn.Sequential(nn.Linear(3, 3), nn.GELU("tanh")), lambda x: x, nn.ReLU6()]
     weighted = nn.utils.parametrizations.weight_norm(nn.Linear(3, 3))
@@ -237,7 +237,7 @@ def test_what_a_chain_does_not_know_is_differentiated():
 
 
 @pytest.mark.parametrize("kind", ["compute", "hook", "wrapper", "mixin"])
-def test_who_changes_what_a_sub_model_computes_changes_its_jacobian(float64, kind):
+def test_overriding_a_computation_replaces_its_jacobian(float64, kind):
     """Oracle: the factor."""
 
     class Doubled(Select):

@@ -12,7 +12,7 @@ def bump(column, row, height=24, width=36, sigma=2.0):
     return -((columns - column) ** 2 + (rows - row) ** 2) / (2 * sigma**2)
 
 
-def test_a_bump_is_found_where_it_is(float64):
+def test_keypoint_of_a_bump(float64):
     places = [(18.0, 12.0), (10.25, 9.5), (25.5, 14.0)]
     features = torch.stack([bump(*place) for place in places]).unsqueeze(0)
     out = SpatialSoftArgmax(3)(features)[0]

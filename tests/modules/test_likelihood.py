@@ -40,7 +40,7 @@ def test_gaussian_likelihood_is_the_normal_density(batch, members):
     torch.testing.assert_close(GaussianLikelihood()(td)["forecast", "log_likelihood"], expected)
 
 
-def test_gaussian_likelihood_of_what_is_observed():
+def test_gaussian_likelihood_of_observed_components():
     td = reading((4,))
     observed = torch.tensor([[True, True], [True, False], [False, True], [False, False]])
     normal = Normal(td["forecast", "observation"], td["sensor", "noise"].sqrt().unsqueeze(-2))
@@ -84,7 +84,7 @@ def test_learned_likelihood_is_bounded(bound, lowest):
     assert model.module.weight.grad.isfinite().all()
 
 
-def test_learned_likelihood_of_what_is_observed():
+def test_learned_likelihood_of_observed_components():
     model = LearnedLikelihood(F, OBS, num_cells=(8,), loc=[1.0, -2.0])
     observed = torch.tensor([[True, True], [True, False], [False, False]])
     td = reading((3,)).set("observed", observed)
@@ -124,7 +124,7 @@ SEES_READING = LearnedLikelihood(F, OBS, num_cells=(4,), observation_key=("senso
 @pytest.mark.parametrize(
     "model", [GaussianLikelihood(), LearnedLikelihood(F, OBS, num_cells=(4,)).double(), SEES_READING.double()]
 )
-def test_nan_behind_a_mask_leaves_gradients_finite(model):
+def test_masked_nan_has_finite_gradients(model):
     td = reading((4,)).set("observed", torch.tensor([[True], [False], [True], [False]]))
     hidden = ~td["observed"]
     leaves = []

@@ -34,7 +34,7 @@ def everywhere(observations=S):
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("samples", [False, True])
-def test_where_all_is_near_it_is_the_global_transform(float64, batch, samples):
+def test_full_neighbourhoods_equal_the_global_transform(float64, batch, samples):
     td = inputs(batch)
     if samples:
         td["sensor", "ensemble"] = td["sensor", "ensemble"].unsqueeze(-2) + torch.randn(*batch, E, S)
@@ -91,7 +91,7 @@ def test_diagnostics_take_each_observation_by_itself(float64):
     torch.testing.assert_close(out["info", "innovation"], (reading - normal.mean).masked_fill(hidden, 0))
 
 
-def test_only_what_an_observation_reaches_is_inflated_and_rotated(float64):
+def test_only_components_near_an_observation_are_inflated_and_rotated(float64):
     """Radius 1: of observations 0 and 1 alone, components from 5 on see nothing; the last row sees nothing at all."""
     td = inputs()
     td["observed"] = torch.zeros(3, S, dtype=torch.bool)
@@ -120,16 +120,16 @@ def test_gradients_equal_finite_differences(float64):
     directional_check(lambda: module(td.copy())["belief", "ensemble"].square().sum(), leaves)
 
 
-def test_what_would_never_be_trained_raises_by_name(float64):
+def test_untrained_parameters_raise_by_name(float64):
     """A radius, a taper and the places that it follows from are constants: no gradient step would move them."""
     radius, taper = nn.Parameter(torch.tensor(2.0)), torch.rand(S, S, requires_grad=True)
-    with pytest.raises(ValueError, match=r"radius asks for a gradient .* Detach it"):
+    with pytest.raises(ValueError, match=r"radius requires a gradient .* Detach it"):
         LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
-    with torch.no_grad(), pytest.raises(ValueError, match="radius asks"):
+    with torch.no_grad(), pytest.raises(ValueError, match="radius requires"):
         LocalEnsembleAnalysis.around(PLACES, PLACES, radius)
     for near in (taper, neighbours_of_taper(taper), neighbours(PLACES.clone().requires_grad_(), PLACES, 2.0)):
-        assert_raises(ValueError, "near asks for a gradient", LocalEnsembleAnalysis, near)
-    assert_raises(ValueError, "taper asks for a gradient", EnsembleAnalysis, "sakov", taper=(torch.ones(S, S), taper))
+        assert_raises(ValueError, "near requires a gradient", LocalEnsembleAnalysis, near)
+    assert_raises(ValueError, "taper requires a gradient", EnsembleAnalysis, "sakov", taper=(torch.ones(S, S), taper))
     td = inputs()
     found = LocalEnsembleAnalysis.around(PLACES, PLACES, radius.detach())(td.clone())["belief", "ensemble"]
     assert found.equal(LocalEnsembleAnalysis.around(PLACES, PLACES, 2.0)(td.clone())["belief", "ensemble"])

@@ -28,7 +28,7 @@ BATCHES = [(), (4,), (2, 3)]
 
 
 def shift():
-    """A transition that adds one, deterministically."""
+    """Returns a transition that adds one, deterministically."""
     return LearnedTransition(torch.ones_like)
 
 
@@ -55,7 +55,7 @@ def test_initial_weights_are_equal(batch):
 
 
 def statistics(transition, rows=4000):
-    """Mean and covariance over the members of what one state becomes, and that state."""
+    """Returns the mean and covariance over the members of what one state becomes, and that state."""
     state = torch.randn(S)
     td = TensorDict({("belief", "ensemble"): state.expand(rows, S)})
     out = transition(td)["forecast", "ensemble"]
@@ -126,7 +126,7 @@ def test_noise_model_reads_the_weighted_mean(weights, name, space):
     assert model.module.layers[0].weight.grad.abs().sum() > 0
 
 
-def test_noise_model_reads_what_it_may():
+def test_noise_model_inputs():
     class Lit(SubModel):
         def __init__(self):
             super().__init__(torch.nn.Identity(), [("belief", "mean")], [("forecast", "q")], optional_keys=["light"])

@@ -19,7 +19,7 @@ def belief(*batch, dim=3):
 
 @pytest.mark.parametrize("constant", [True, False])
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_before_training_it_is_diagonal(float64, constant, batch):
+def test_untrained_covariance_is_diagonal(float64, constant, batch):
     noise = CholeskyNoise(3, r=[0.1, 1.0, 2.0], constant=constant)
     cov = noise(belief(*batch))["forecast", "noise"]
     expected = torch.diag(torch.tensor([0.01, 1.0, 4.0])).expand(*batch, 3, 3)

@@ -19,13 +19,13 @@ def image_sensor(**kwargs):
 
 
 def draw(sensor, batch):
-    """Noise that can be indexed by rows, whatever it is made of."""
+    """Returns the noise that can be indexed by rows, whatever it is made of."""
     noise = sensor.draw_noise(batch)
     return noise if isinstance(noise, torch.Tensor) else TensorDict(noise, batch)
 
 
 def naive(sensor, frames, noise):
-    """One forward of the whole network a frame and member."""
+    """Runs the whole network once for each frame and member."""
     out = []
     for index, frame in enumerate(frames):
         for member in range(sensor.ensemble_size):
@@ -158,7 +158,7 @@ def test_floating_point_pixels_up_to_255_are_said_once():
 
 
 @pytest.mark.parametrize("case", ["uint8", "unit", "standardised", "in the units of the pixels", "compiled"])
-def test_no_warning_for_pixels_as_they_should_be(case):
+def test_valid_pixels_do_not_warn(case):
     bright, options = torch.rand(1, 8, 8) * 255, {}
     pixels = {"uint8": bright.byte(), "unit": bright / 255, "standardised": torch.randn(1, 8, 8)}.get(case, bright)
     if case == "in the units of the pixels":

@@ -54,7 +54,7 @@ def test_commands_are_standardised(float64):
 
 
 def moved(pose, velocity, dt):
-    """The vehicle's state after a step with these velocities."""
+    """Returns the vehicle's state after a step with these velocities."""
     (x, y, theta), (v, w) = pose.unbind(-1), velocity.unbind(-1)
     angle = theta + w * dt / 2
     return torch.stack([x + v * dt * angle.cos(), y + v * dt * angle.sin(), theta + w * dt, v, w], -1)

@@ -28,7 +28,7 @@ def trunk_calls(sensor):
 
 
 def run(sensor, frames, observed=None):
-    """Samples and the parameters' gradients of their squares, with the same noise each time."""
+    """Returns samples and the parameters' gradients of their squares, with a fixed seed."""
     torch.manual_seed(1)
     td = TensorDict({"pixels": frames}, [FRAMES])
     if observed is not None:

@@ -28,17 +28,17 @@ def constant_noise(size, r=0.3):
 
 
 def bend(x):
-    """A nonlinear map of three dimensions."""
+    """Returns a nonlinear map of three dimensions."""
     return torch.stack([x[..., 0] + x[..., 1].sin(), x[..., 1] * x[..., 2], x[..., 2].exp()], -1)
 
 
 def range_bearing(x):
-    """Distance and direction of the origin."""
+    """Returns the distance and direction of the origin."""
     return torch.stack([x[..., :2].norm(dim=-1), torch.atan2(x[..., 1], x[..., 0])], -1)
 
 
 def loops(mean, cov, function, alpha, beta, kappa):
-    """Points, their images and both weights, one point at a time."""
+    """Returns points, their images and both weights, one point at a time."""
     dim = len(mean)
     lam = alpha**2 * (dim + kappa) - dim
     root = np.linalg.cholesky((dim + lam) * cov)
@@ -143,7 +143,7 @@ def test_a_pose_that_is_known_exactly(dtype):
         directional_check(loss, [velocity.layers[0].weight], rtol=1e-4)
 
 
-def test_points_are_drawn_anew_for_the_analysis(float64):
+def test_sigma_points_are_redrawn_for_the_analysis(float64):
     # With the forecast's points, process noise would not reach the innovation's covariance: S would be R.
     td = TensorDict({"belief": {"mean": torch.zeros(1), "cov": torch.zeros(1, 1)}})
     td["sensor"] = {"ensemble": torch.ones(1), "noise": torch.ones(1)}

@@ -50,7 +50,7 @@ def test_an_inert_gate_is_the_filter_bit_for_bit(name, response):
 
 
 def still(variance=1.0, noise=1.0, **kwargs):
-    """A state that does not move, in one dimension: the update is a weighted mean."""
+    """Returns a state that does not move, in one dimension: the update is a weighted mean."""
     one = torch.eye(1, dtype=torch.float64)
     filter = KalmanFilter(
         one, one, process_noise_cov=0 * one, noise_cov=noise * one, mean=torch.zeros(1).double(), cov=variance * one
@@ -122,7 +122,7 @@ def test_each_response_comes_back_after_a_jump(kind, response, jump):
 
 @pytest.mark.parametrize("name", ["Kalman", "EKF", "etkf", "perturbed"])
 @pytest.mark.parametrize("response", RESPONSES)
-def test_a_gate_around_an_update_that_heeds_whether_the_sensor_sees(name, response):
+def test_gate_around_an_update_with_visibility(name, response):
     """A sensor that surely sees is one without Visible, and an inert gate is no gate."""
     filter, td = FILTERS[name]().double(), data(steps=8)
     heeds = filter.with_modules(analysis=Visible(filter["analysis"], visible_key="visible"))
@@ -137,7 +137,7 @@ def test_a_gate_around_an_update_that_heeds_whether_the_sensor_sees(name, respon
     assert all(torch.equal(plain[key], inert[key]) for key in heeds.out_keys)
 
 
-def test_a_hidden_sensor_does_not_open_the_gate():
+def test_missing_readings_do_not_open_the_gate():
     one = torch.eye(1, dtype=torch.float64)
     analysis = Visible(KalmanAnalysis(one, 0.09 * one), visible_key="visible")
     filter = still(0.01, 0.09).with_modules(analysis=analysis)
@@ -152,7 +152,7 @@ def test_a_hidden_sensor_does_not_open_the_gate():
 
 
 def simulate(runs, steps, factor=1.0):
-    """States and readings of the linear system, whose noise is by a factor larger in variance than it says."""
+    """Returns states and readings of the linear system whose noise variance is larger by a factor than R."""
     F, Q, H, R = linear_system(torch.float64)
     generator = torch.Generator().manual_seed(0)
     moved, read = torch.randn(2, runs, steps, DIM, generator=generator, dtype=torch.float64)
@@ -222,7 +222,7 @@ def test_gradients_are_those_of_finite_differences(response):
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_nothing_behind_the_mask_counts(response):
+def test_masked_components_have_no_effect(response):
     td = data(steps=20)
     td["observation"][:, 5:8] = torch.nan
     td["observed"] = torch.ones(3, 20, 1, dtype=torch.bool)
@@ -235,7 +235,7 @@ def test_nothing_behind_the_mask_counts(response):
             assert torch.equal(out["gate", key][:, 4], out["gate", key][:, 7]), (name, key)
 
 
-def test_calibration_holds_what_clean_data_show():
+def test_calibration_matches_the_false_alarm_rate():
     """Innovations twice as large as expected open no gate that was calibrated on such."""
     gated = still(1.0, 0.25, response="reject", window=3, rate=0.01)
     readings = torch.randn(40, 200, 1, generator=torch.Generator().manual_seed(0)).double()
@@ -248,7 +248,7 @@ def test_calibration_holds_what_clean_data_show():
 
 
 def gate_of(kind, dim=1, **options):
-    """A gate around the update of a forecast N(0, 1) by readings with noise 1, and that forecast."""
+    """Returns a gate around the update of a forecast N(0, 1) by readings with noise 1, and that forecast."""
     if kind == "ensemble":
         members = torch.randn(5 * dim, dim).double()
         members = members - members.mean(0)
@@ -299,7 +299,7 @@ def test_adapted_spread_is_never_below_the_forecasts_own(kind):
         assert torch.equal(td["belief", "var"], plain["belief", "var"])
 
 
-def test_what_was_rejected_is_believed_again_when_it_fits_well():
+def test_rejected_sensor_is_accepted_again_when_consistent():
     """6.0 lies below the limit, 10.8, and above that of a reading whose forerunner was rejected, 3.8."""
     gate, td = gate_of("Kalman", response="reject", window=1, rate=1e-3)
     factors = []
@@ -309,7 +309,7 @@ def test_what_was_rejected_is_believed_again_when_it_fits_well():
     assert factors == [1.0, math.inf, math.inf, 1.0, 1.0]
 
 
-def test_a_gap_without_readings_does_not_begin_the_patience_anew():
+def test_gap_does_not_reset_the_patience():
     gate, td = gate_of("Kalman", response="reject", window=1, patience=3)
     td["reading"], shut = torch.tensor([50.0]).double(), []
     for observed in (True, True, False, True, True):
@@ -328,7 +328,7 @@ def test_a_rejected_reading_is_no_measure_of_the_noise(kind):
     assert found == pytest.approx([0.1 * (1 / 2 - 1)] * 3)
 
 
-def test_by_component_the_given_mask_counts_beside_what_is_rejected():
+def test_by_component_combines_mask_and_rejection():
     gate, td = gate_of("ensemble", 3, response="reject", window=1, by_component=True)
     td["reading"] = torch.tensor([1.0, 40.0, 2.0]).double()
     given, kept = torch.tensor([True, True, False]), torch.tensor([True, False, False])
@@ -340,7 +340,7 @@ def test_by_component_the_given_mask_counts_beside_what_is_rejected():
 
 @pytest.mark.parametrize(("name", "by_component"), [*((name, False) for name in FILTERS), ("etkf", True)])
 @pytest.mark.parametrize("response", ["reject", "huber"])
-def test_with_an_adapted_spread_a_hidden_or_rejected_reading_is_as_good_as_none(name, by_component, response):
+def test_adapted_spread_ignores_missing_and_rejected_readings(name, by_component, response):
     """The spread is adapted where a reading is used: without one it would grow from step to step, without end."""
     gated = Gated(FILTERS[name](), DIM, adapt_inflation=0.3, response=response, window=1, by_component=by_component)
     row, outs = run(gated, data(steps=20))[:, -1], {}

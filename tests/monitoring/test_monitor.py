@@ -156,7 +156,7 @@ def test_the_alarm_names_the_sensor_that_fails():
     assert out["sensor"][1, 32:].unique().tolist() == [0]
 
 
-def test_what_is_not_observed_changes_nothing():
+def test_missing_observations_change_nothing():
     data = simulate(3, 40)
     data["observed"] = torch.ones(3, 40, 1, dtype=torch.bool)
     data["observed"][:, 20:30] = False

@@ -48,7 +48,7 @@ def data(float64):
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_it_gives_what_ours_gives(data, way):
+def test_custom_analysis_equals_the_library_one(data, way):
     if way == "rejected":
         data["observation"][1, 4] = torch.nan
     ours, own = (WAYS[way](linear_denkf(ensemble_size=8).with_modules(analysis=part)) for part in both())

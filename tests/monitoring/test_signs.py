@@ -25,7 +25,7 @@ def test_clean_readings_are_taken_out_at_the_rate(rate):
     assert gate.limits.tolist() == pytest.approx([quantile] * 3, rel=0.08)
 
 
-def test_floor_margin_and_what_is_not_known():
+def test_floor_margin_and_unknown_signs():
     data = TensorDict({"signs": torch.stack([torch.zeros(100), torch.arange(100.0)], -1)}, [100])
     gate = SignGate(2, rate=0.02, floor=(0.5, 0.0)).calibrate([data], margin=2.0)
     assert gate.limits.tolist() == [0.5, 196.0]

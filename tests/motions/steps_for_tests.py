@@ -17,7 +17,7 @@ MOTIONS = {
 
 
 def random_points(space, *shape):
-    """Points around the neutral one."""
+    """Returns points around the neutral one."""
     return space.exp(torch.randn(*shape, space.tangent_dim))
 
 
@@ -28,18 +28,18 @@ def frame(motion, *batch, still=False):
 
 
 def step(motion, state, **entries):
-    """The forecast of states [*B, E, P]."""
+    """Returns the forecast of states [*B, E, P]."""
     td = TensorDict({("belief", "ensemble"): state, **entries}, state.shape[:-2])
     return motion(td)["forecast", "ensemble"]
 
 
 def observe(reading, state):
-    """The predicted readings of states [*B, E, P]."""
+    """Returns the predicted readings of states [*B, E, P]."""
     return reading(TensorDict({("forecast", "ensemble"): state}, state.shape[:-2]))["forecast", "observation"]
 
 
 def inertial_state(pose, gyro_bias=(0.0, 0.0, 0.0), accelerometer_bias=(0.0, 0.0, 0.0)):
-    """States [E, 16] of poses [E, 10]."""
+    """Returns states [E, 16] of poses [E, 10]."""
     biases = torch.tensor([*gyro_bias, *accelerometer_bias], dtype=pose.dtype)
     return torch.cat([pose, biases.expand(*pose.shape[:-1], 6)], -1)
 

@@ -35,7 +35,7 @@ def drives(*batch, count=12):
 
 
 def by_hand(frames):
-    """Mean and covariance with F and Q of each step in their closed form; the first frame is not read."""
+    """Returns the mean and covariance with F and Q of each step in their closed form; the first frame is not read."""
     mean, cov = torch.zeros(len(frames), 2), torch.eye(2).expand(len(frames), 2, 2)
     means, covs = [mean], [cov]
     for row in frames.unbind(1)[1:]:
@@ -59,7 +59,7 @@ def parts():
 
 
 @pytest.mark.parametrize("kind", ["EKF", "UKF", "Euler"])
-def test_a_kalman_filter_of_irregular_steps(float64, kind):
+def test_kalman_filter_with_irregular_steps(float64, kind):
     motion, noise = parts()
     transition, q = motion, noise
     if kind == "UKF":
@@ -76,7 +76,7 @@ def test_a_kalman_filter_of_irregular_steps(float64, kind):
     assert_close(out["belief", "cov"], cov, rtol=0, atol=1e-10)
 
 
-def test_an_ensemble_of_irregular_steps(float64):
+def test_ensemble_with_irregular_steps(float64):
     motion, noise = parts()
     filter = DEnKF(
         transition=motion,

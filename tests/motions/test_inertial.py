@@ -58,7 +58,7 @@ def test_turn_and_its_integrals_are_a_matrix_exponential(turn):
     assert_close(moved[7:], exact[:3, 4], rtol=0, atol=1e-12)
 
 
-def test_biases_are_what_is_read_too_much():
+def test_biases_are_subtracted_from_the_readings():
     pose = random_points(SE23(), 4)
     imu, wrong = torch.randn(6), torch.randn(6)
     biased = step(InertialMotion(0.3), inertial_state(pose, wrong[:3].tolist(), wrong[3:].tolist()), imu=imu + wrong)
@@ -91,7 +91,7 @@ def test_turning_and_moving_the_world_changes_nothing_else():
     assert_close(there, elsewhere(step(motion, state, imu=imu), 0.4), rtol=0, atol=1e-13)
 
 
-def test_the_error_of_a_pose_grows_linearly_and_knows_no_state():
+def test_pose_error_is_linear_and_state_independent():
     """Barrau & Bonnabel 2017, theorems 1 and 2: of two poses with the same biases, exactly, however large it is."""
     motion, imu, error = InertialMotion(0.4), torch.randn(6), 0.4 * torch.randn(9)
 

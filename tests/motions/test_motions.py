@@ -92,7 +92,7 @@ def test_the_jacobian_is_that_of_differences(float64, make, still):
         (lambda: InertialMotion(0.1).process_noise, "given no noise"),
     ],
 )
-def test_what_makes_no_sense_raises(make, argument):
+def test_invalid_arguments_raise(make, argument):
     with pytest.raises((TypeError, ValueError), match=argument):
         make()
 

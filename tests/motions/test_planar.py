@@ -27,7 +27,7 @@ def test_a_circle(turn):
     assert_close(moved, expected, rtol=0, atol=1e-11)
 
 
-def test_it_is_the_motion_of_the_wheels_study_in_the_limit_of_short_steps(monkeypatch):
+def test_equals_the_unicycle_for_short_steps(monkeypatch):
     errors = []
     order = [2, 0, 1, 3, 4, 5, 6]  # heading first
     start = torch.tensor([0.1, 0.2, 0.3, 1.4, 0.5, 0.02, 1.1])

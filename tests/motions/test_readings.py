@@ -56,7 +56,7 @@ def test_landmarks_in_the_plane(float64):
     assert reading.reading_space == Product(Euclidean(1), Circle())
 
 
-def test_a_pose_is_read_as_it_is():
+def test_pose_of_returns_the_pose():
     state = random_points(DEEP, 5, 4)
     assert observe(PoseOf(DEEP, part=1), state).equal(state[..., 2:])
     assert PoseOf(DEEP, part=1).reading_space == SE3()
@@ -113,13 +113,13 @@ def test_the_jacobian_is_that_of_differences(float64, make):
         (lambda: PositionInBody(SE2(), [1.0, float("nan")]), "landmark must be finite"),
     ],
 )
-def test_what_makes_no_sense_raises(make, words):
+def test_invalid_arguments_raise(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
 
 
 @pytest.mark.parametrize("space", [Product(SO3(), SE2()), Product(Euclidean(1), SE23(), SE2())])
-def test_a_part_begins_behind_the_points_of_those_before_it(space):
+def test_part_offset_in_a_product(space):
     """A rotation in front has four numbers, and three directions."""
     state = random_points(space, 5, 4)
     pose = state[..., -3:]
@@ -129,7 +129,7 @@ def test_a_part_begins_behind_the_points_of_those_before_it(space):
 
 
 @pytest.mark.parametrize("kind", [PositionInBody, RangeBearing])
-def test_landmarks_that_stand_in_the_data(float64, kind):
+def test_landmarks_from_the_data(float64, kind):
     """Each row reads its own ones, as the same landmarks given as constants are read."""
     pose, posts = torch.randn(5, 4, 3), torch.randn(5, 6)
     key = ("forecast", "observation")
@@ -143,7 +143,7 @@ def test_landmarks_that_stand_in_the_data(float64, kind):
 
 
 @pytest.mark.parametrize("kind", [PositionInBody, RangeBearing])
-def test_the_jacobian_of_landmarks_that_stand_in_the_data(float64, kind):
+def test_jacobian_of_landmarks_from_the_data(float64, kind):
     """Against differences along the tangents of the pose."""
     model, pose, posts = kind(SE2(), landmark_key="posts", count=2), torch.randn(1, 3), torch.randn(4)
     _, matrix = model.jacobian(pose, posts)

@@ -41,7 +41,7 @@ def test_without_a_field_the_slope_alone_is_known(float64):
         torch.testing.assert_close(Gravity(SO3())(seen)["forecast", "observation"][0], gravity)
 
 
-def test_where_a_robot_stands_still():
+def test_standstill_detection():
     rate, force = 0.01 * torch.randn(2, 50, 3), 9.81 + 0.05 * torch.randn(2, 50, 3)
     force[0, 20], rate[1, 30] = 11.0, 0.5
     still = stands_still(rate, force, window=2, rate_noise=0.01, acceleration_noise=0.05).squeeze(-1)

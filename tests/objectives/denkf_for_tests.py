@@ -9,7 +9,7 @@ CLOSE = {"rtol": 1e-12, "atol": 1e-13}
 
 
 def pairs(x, distance):
-    """Mean distance of different members, by a double loop."""
+    """Returns the mean distance of different members, by a double loop."""
     size = x.shape[-2]
     terms = [distance(x[..., i, :] - x[..., j, :]) for i in range(size) for j in range(size) if i != j]
     return sum(terms) / len(terms)

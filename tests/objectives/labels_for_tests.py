@@ -28,7 +28,7 @@ TERMS = {"state": "belief", "transition": "forecast"}
 
 
 def case(name, *, terms=("state", "transition"), **options):
-    """A filter, frames with noise and labels, what the filter makes of them, and a loss."""
+    """Returns a filter, frames with noise and labels, what the filter makes of them, and a loss."""
     make, loss, settings = CASES[name]
     filter = make()
     frames, out = problem(filter)
@@ -36,7 +36,7 @@ def case(name, *, terms=("state", "transition"), **options):
 
 
 def element(name, out, prefix, index, truth, dims, scale):
-    """The score of one element ``index`` in some dimensions, with nothing masked."""
+    """Returns the score of one element ``index`` in some dimensions, with nothing masked."""
     kind, score = name.split("-")
     dims, unit = list(dims), torch.tensor(scale)[list(dims)]
     y = truth[index][dims]
@@ -64,7 +64,7 @@ def element(name, out, prefix, index, truth, dims, scale):
 
 
 def by_hand(name, out, prefix, truth, labelled, counts, scale=(1.0,) * S):
-    """The mean over the elements that count and have labels, each scored in its labelled dimensions alone."""
+    """Returns the mean over the elements that count and have labels, each scored in its labelled dimensions alone."""
     found = []
     for index in (counts & labelled.any(-1)).nonzero().tolist():
         dims = labelled[tuple(index)].nonzero().flatten().tolist()
@@ -74,7 +74,7 @@ def by_hand(name, out, prefix, truth, labelled, counts, scale=(1.0,) * S):
 
 
 def gaps():
-    """Labels of some elements, or of some dimensions, for ``[2, 7]`` elements."""
+    """Returns labels of some elements, or of some dimensions, for ``[2, 7]`` elements."""
     whole = torch.rand(2, 7, 1) < 0.6
     some = torch.rand(2, 7, S) < 0.5
     some[:, ::2] = False  # elements without any

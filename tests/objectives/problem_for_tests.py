@@ -1,4 +1,4 @@
-"""Holds what tests of objectives start from: frames with the truth, weights of one term, what counts, and training."""
+"""Fixtures of objective tests: frames with true states, weights of one term, a mask of scored rows, and training."""
 
 import torch
 
@@ -6,19 +6,19 @@ from tests.filters.factories import OBS, S, toy_frames
 
 
 def problem(filter, batch=(2, 7), **kwargs):
-    """Frames with noise, true states and true observations, and what the filter makes of them."""
+    """Returns frames with noise, true states and true observations, and what the filter makes of them."""
     frames = filter.draw_noise(toy_frames(batch, **kwargs))
     frames["state"], frames["target_observation"] = torch.randn(*batch, S), torch.randn(*batch, OBS)
     return frames, filter.sequence(frames.copy())
 
 
 def only(terms, name, weight=1.0):
-    """Weights that are zero for all other terms."""
+    """Returns weights that are zero for all other terms."""
     return {term: weight * (term == name) for term in terms}
 
 
 def stepped(frames):
-    """Elements that were stepped to."""
+    """Returns a mask of elements that a step has led to."""
     mask = ~frames["is_init"].squeeze(-1)
     mask[..., 0] = False
     return mask

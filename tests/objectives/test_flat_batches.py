@@ -13,7 +13,7 @@ CURE = r"TensorDictReplayBuffer.*reshape.*batch\[None\]"
 
 
 def episodes(*, following=True, init=False):
-    """Episodes end to end, as they are stored."""
+    """Returns concatenated episodes, as they are stored."""
     rows = []
     for index, count in enumerate(LENGTHS):
         values = torch.randn(count + 1, 2)
@@ -140,7 +140,7 @@ def test_an_episode_that_is_done_needs_a_mark_after_it():
     assert_raises(rows, r"is done, and the next begins, at 6")
 
 
-# ------------------------------------------------------------------------------------- what breaks, and what goes on
+# ------------------------------------------------------------------------------------- what breaks, and what continues
 
 
 def rows_of(count=12):
@@ -148,7 +148,7 @@ def rows_of(count=12):
 
 
 def with_next(rows, breaks_at=None):
-    """``rows`` and a ``"next"`` part that is what follows, but for one break."""
+    """``rows`` and a ``"next"`` part that is what follows, except for one break."""
     following = torch.roll(rows["observation"], -1, 0).clone()
     if breaks_at is not None:
         following[breaks_at - 1] += 1.0

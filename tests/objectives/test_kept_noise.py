@@ -119,7 +119,7 @@ def test_the_log_ratio_before_an_update_is_zero(float64, name):
 
 
 @every_filter
-def test_without_it_noise_is_drawn_anew(float64, name):
+def test_without_keep_noise_new_noise_is_drawn(float64, name):
     policy = make_policy(FILTERS[name]())
     data = rollout(policy)
     anew = make_policy(policy[0].with_options(keep_noise=False))
@@ -155,7 +155,7 @@ def test_gradients_are_those_of_the_steps_that_were_taken(float64):
     torch.testing.assert_close(gradient[0], central_difference(total, weight, 0), rtol=1e-5, atol=1e-6)
 
 
-def test_a_buffers_slices_and_workers_keep_it_too(float64):
+def test_buffers_and_workers_keep_the_noise(float64):
     policy = make_policy(toy_denkf())
     data = rollout(policy, forked_env(2, partial(world, max_steps=6)))
     assert log_ratio(policy, data).abs().max() < 1e-9
@@ -175,7 +175,7 @@ def collected(kind, policy, *, envs):
 
 @pytest.mark.parametrize("kind", [Collector, pytest.param(MultiSyncCollector, marks=pytest.mark.slow)])
 def test_collectors_keep_it(kind):
-    """The second batch goes on in the middle of episodes."""
+    """The second batch continues in the middle of episodes."""
     policy = make_policy(toy_denkf())
     make = partial(world, max_steps=5)
     for data in collected(kind, policy, envs=make if kind is Collector else [make, make]):

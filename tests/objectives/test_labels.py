@@ -38,7 +38,7 @@ def agree(value, expected, module, **close):
 
 
 def hidden(frames, labelled, how):
-    """Frames whose labels have gaps, told by a mask or by NaN."""
+    """Returns frames whose labels have gaps, told by a mask or by NaN."""
     frames = frames.clone()
     if how == "NaN":
         frames["state"] = torch.where(labelled, frames["state"], NAN)
@@ -61,7 +61,7 @@ def test_gaps_are_as_if_the_labels_were_not_there(name, how):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_whatever_stands_in_a_gap_has_no_value_and_no_gradient(name):
+def test_gaps_have_no_loss_and_no_gradient(name):
     filter, frames, _, loss = case(name)
     _, labelled = gaps()
     first = sum(loss(hidden(frames, labelled, "mask")).values())
@@ -140,7 +140,7 @@ def test_a_sensor_learns_as_if_rows_without_labels_were_taken_out(score, how):
 
 
 def known_filter(observation):
-    """A learned sensor behind a known observation."""
+    """Returns a learned sensor behind a known observation."""
     toy = toy_denkf()
     return DEnKF(toy["transition"], toy["sensor"], observation, toy["noise"], EnsembleAnalysis(), initial=toy.initial)
 

@@ -33,7 +33,7 @@ def test_gradient_by_finite_differences(scheme, score):
     loss = MixtureLoss(filter, score=score, mean=0.3, component_std=0.5)
     sum(loss(frames).values()).backward()
     parts = [filter[name] for name in ("observation", "likelihood", "transition")]
-    # A jump, a particle picked anew within 1e-6, would show as a difference of order 1e5.
+    # A jump, a particle picked again within 1e-6, would show as a difference of order 1e5.
     assert check_largest_gradients(parts, lambda: sum(loss(frames).values()), rtol=1e-4, atol=1e-8) >= 6
 
 

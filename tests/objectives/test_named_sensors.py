@@ -45,7 +45,7 @@ def start(gaussian):
 
 
 def fused(kind, *, lidar=False, **options):
-    """A state of two components: a wheel, whose model comes first, reads the second, and a camera the first."""
+    """Returns a state of two components: a wheel, whose model comes first, reads the second, and a camera the first."""
     sensors = {"wheel": FusedSensor(Select([1]), [0.3]), "camera": FusedSensor(Select([0]), [NOISE], sensor=camera())}
     if lidar:
         sensors["lidar"] = FusedSensor(Select([1]), [0.2], sensor=camera(image_key="scan"))
@@ -62,7 +62,7 @@ def data():
 
 
 def off(drive, component=0, key="pixels"):
-    """Errors of a camera's readings, in the pictures that show anything."""
+    """Returns errors of a camera's readings, in the pictures that show anything."""
     error = 2 * drive[key].flatten(-3).mean(-1) + 0.1 - drive["state"][..., component]
     return error[drive[key].flatten(-3).amax(-1) > 0.02]
 
@@ -99,10 +99,10 @@ def test_each_of_several_learned_sensors_is_named(kind):
         torch.testing.assert_close(loss(drive)["loss_sensor"], off(drive, component, key).abs().mean())
     loss.set_keys(sensor=None)
     for several in (loss, SensorLoss(filter)):
-        none = r"several sensors, of which none is named \(there are \['camera', 'lidar'\]\).*set_keys\(sensor="
+        none = r"several sensors, of which none is selected \(there are \['camera', 'lidar'\]\).*set_keys\(sensor="
         with pytest.raises(KeyError, match=none):
             several(drive)
-        with pytest.raises(KeyError, match=r"writes the samples .*'lidar'.*: name one of several sensors"):
+        with pytest.raises(KeyError, match=r"writes the samples .*'lidar'.*: select one of several sensors"):
             several(drive.copy().set("target_observation", drive["wheel"]))
 
 
@@ -111,7 +111,7 @@ def test_the_observation_model_is_that_of_the_sensor():
     loss = ObservationLoss(fused("ensemble"))
     loss.set_keys(sensor="wheel")
     drive["target_observation"] = drive["state"][..., 1:] + 2
-    with pytest.raises(KeyError, match=r"several sensors: name one, set_keys\(sensor="):
+    with pytest.raises(KeyError, match=r"several sensors: select one, set_keys\(sensor="):
         ObservationLoss(fused("ensemble", lidar=True))(drive)
     torch.testing.assert_close(loss(drive)["loss_observation"], torch.tensor(4.0))
 
@@ -129,7 +129,7 @@ def test_a_filter_of_one_sensor_with_keys_of_its_own(kind, score):
     torch.testing.assert_close(loss(drive)["loss_sensor"], off(drive).abs().mean())
 
 
-def test_a_frame_that_is_missing_is_named_with_what_is_there():
+def test_missing_entry_is_named_with_the_available_ones():
     loss = SensorLoss(fused("ensemble", lidar=True))
     loss.set_keys(sensor="lidar")
     with pytest.raises(KeyError, match=r"SensorLoss reads 'scan', which is missing. There is .*scans"):

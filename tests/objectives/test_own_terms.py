@@ -1,4 +1,4 @@
-"""Terms of a user's own: beside a loss's terms and alone, what counts, their parameters, and what is refused."""
+"""Custom loss terms: alone and together with a loss's terms, their rows, their parameters, and their errors."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from torch_denkf.objectives.filter_loss import FilterLoss
 
 
 class Absolute(Term):
-    """The absolute error of the belief's mean, times what it learns."""
+    """Absolute error of the belief's mean, times a learned factor."""
 
     name = "absolute"
 
@@ -49,7 +49,7 @@ def _double(float64):
     return
 
 
-def test_own_terms_by_hand():
+def test_custom_terms_equal_values_by_hand():
     filter = toy_denkf()
     frames, out = problem(filter)
     frames["state_observed"] = torch.rand(2, 7, S) < 0.6
@@ -69,7 +69,7 @@ def test_own_terms_by_hand():
 
 
 @pytest.mark.parametrize(("make", "filter"), [(DEnKFLoss, toy_denkf), (GaussianLoss, linear_kalman)])
-def test_own_terms_beside_those_of_a_loss(make, filter):
+def test_custom_terms_are_added_to_those_of_a_loss(make, filter):
     filter = filter()
     options = {"sensor": 0.0}
     keys = make(filter, **options).out_keys
@@ -82,7 +82,7 @@ def test_own_terms_beside_those_of_a_loss(make, filter):
         assert all(both[key].equal(alone[key]) for key in keys)
 
 
-def test_a_term_has_parameters_of_its_own():
+def test_parameters_of_a_term_are_trained():
     filter = toy_denkf()
     frames, _ = problem(filter)
     term = Absolute()
@@ -93,7 +93,7 @@ def test_a_term_has_parameters_of_its_own():
     assert any(p.grad is not None and p.grad.any() for p in filter.parameters())
 
 
-def test_the_true_state_is_asked_for_where_a_term_needs_it():
+def test_true_state_is_required_only_by_terms_that_need_it():
     filter = toy_denkf()
     frames, _ = problem(filter)
     assert "state" in FilterLoss(filter, [Absolute()]).in_keys

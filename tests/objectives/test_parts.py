@@ -116,7 +116,7 @@ def test_the_observation_alone_is_the_term_of_the_whole():
 
 
 def forecasts_by_hand(filter, frames):
-    """One element and one time after the other, by the transition on a TensorDict."""
+    """Runs the transition on a TensorDict, one element and one time after the other."""
     out = torch.zeros(2, 7, E, S)
     for b in range(2):
         for t in range(1, 7):
@@ -146,7 +146,7 @@ def test_the_transition_from_true_states_by_hand(score):
     torch.testing.assert_close(loss(frames.reshape(14))["loss_transition"], value, **CLOSE)
 
 
-def test_what_starts_and_what_is_padding_does_not_count():
+def test_resets_and_padding_are_not_scored():
     filter = toy_denkf(layer="none")
     frames, _ = problem(filter)
     loss = TransitionLoss(filter, score="mse", reduction="none")

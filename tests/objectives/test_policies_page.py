@@ -1,4 +1,4 @@
-"""The programs of the page on policies: which gradients reach the filter, and what is filtered anew."""
+"""The programs of the page on policies: which gradients reach the filter, and what is filtered again."""
 
 from functools import cache
 
@@ -23,7 +23,7 @@ def code(name):
 
 @cache
 def run(name):
-    """The program's names after it ran, with the small setting of the page."""
+    """Returns the program's names after it ran, with the small setting of the page."""
     names = {}
     exec(compile(code(name), f"{name} of the page", "exec"), names)
     return names
@@ -74,7 +74,7 @@ def test_ddpgs_losses_reach_no_filter_in_front_and_the_actors_one_inside():
 
 
 @pytest.mark.parametrize("name", ["sac", pytest.param("ddpg", marks=pytest.mark.slow)])
-def test_what_was_believed_after_the_start_of_a_slice_does_not_matter(name):
+def test_stored_beliefs_inside_a_slice_have_no_effect(name):
     names = run(name)
     losses = []
     batch = slices(names)

@@ -15,7 +15,7 @@ NLL = {"state": 0.0, "transition": 0.0, "sensor": 0.0, "nll": 1.0, "reduction": 
 
 
 def exact(key, rows=slice(None)):
-    """The Kalman filter of some rows of the linear system's readings."""
+    """Returns the Kalman filter of some rows of the linear system's readings."""
     F, Q, H, R = linear_system()
     prior = {"mean": torch.tensor([1.0, -1.0]), "cov": torch.diag(torch.tensor([1.0, 2.0]))}
     return KalmanFilter(F, H[rows], process_noise_cov=Q, noise=R[rows].sqrt(), observation_key=key, **prior)

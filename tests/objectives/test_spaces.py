@@ -64,7 +64,7 @@ def value(name, data, **options):
 
 
 def beliefs(space, center, spread=0.3):
-    """Truth, members with weights, mean and covariance around a point, or around points ``[B, T, P]``."""
+    """Returns the truth, members with weights, mean and covariance around a point, or around points ``[B, T, P]``."""
 
     def around(*extra):
         return space.plus(center.expand(*extra, space.point_dim), spread * torch.randn(*extra, space.tangent_dim))
@@ -80,7 +80,7 @@ def beliefs(space, center, spread=0.3):
 
 
 def points_of(data, change):
-    """The batch with all its points changed."""
+    """Returns the batch with all its points changed."""
     out = data.clone()
     for key in ("state", ("belief", "mean"), ("belief", "ensemble")):
         out[key] = change(data[key])
@@ -88,7 +88,7 @@ def points_of(data, change):
 
 
 def for_kind(name, data):
-    """The belief that a loss reads: of members without weights, its key is the ensemble's."""
+    """Returns the belief that a loss reads: of members without weights, its key is the ensemble's."""
     return data.exclude(("belief", "log_weight")) if name.startswith("members") else data
 
 
@@ -102,7 +102,7 @@ OPTIONS = {
 
 @pytest.mark.parametrize("options", OPTIONS)
 @pytest.mark.parametrize("name", LOSSES)
-def test_angles_and_numbers_are_scored_as_they_were(name, options):
+def test_angles_and_numbers_equal_the_plain_scores(name, options):
     # Headings on both sides of the cut, and members within half a turn of the truth.
     space = Product(Circle(), Euclidean(2))
     data = for_kind(name, beliefs(space, torch.tensor([math.pi - 0.05, 1.0, -2.0])))
@@ -120,7 +120,7 @@ def test_angles_and_numbers_are_scored_as_they_were(name, options):
 
 @pytest.mark.parametrize("space", [SO3(), SE2(), SE3(), SE23()], ids=repr)
 @pytest.mark.parametrize("name", LOSSES)
-def test_near_a_point_they_are_those_of_numbers(name, space):
+def test_losses_near_a_point_equal_euclidean_losses(name, space):
     small, size = 1e-4, space.tangent_dim
     numbers = for_kind(name, beliefs(Euclidean(size), torch.zeros(size), spread=1.0))
     center = space.exp(torch.randn(size))

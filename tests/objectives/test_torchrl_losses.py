@@ -57,7 +57,7 @@ def collected(filter, frames):
 
 
 def beliefs_by_hand(filter, data):
-    """The belief's mean at every root and every next observation, one step after the other."""
+    """Returns the belief's mean at every root and every next observation, one step after the other."""
     roots, nexts, carry = [], [], None
     for t in range(data.shape[1]):
         row = data[:, t]
@@ -180,7 +180,7 @@ def q_of(loss, mean, action, number=0):
 
 
 def soft_value(head, mean, q):
-    """The worth of an action that is drawn, by the less of two critics, with the reward of its entropy."""
+    """Returns the worth of an action that is drawn, by the less of two critics, with the reward of its entropy."""
     chosen = TanhNormal(*head(mean))
     action = chosen.rsample()
     worth = torch.stack([q(mean, action, number) for number in (0, 1)]).min(0).values
@@ -188,13 +188,13 @@ def soft_value(head, mean, q):
 
 
 def critics_by_hand(data, roots, nexts, head, q):
-    """The squared error of both critics at the beliefs ``roots``."""
+    """Returns the squared error of both critics at the beliefs ``roots``."""
     target = data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft_value(head, nexts, q)
     return sum((q(roots, data["action"], number) - target.detach()).square().mean() for number in (0, 1))
 
 
 def filtered(filter, batch):
-    """Puts what the filter believes now in the place of what it believed while it collected, as on the page."""
+    """Replaces the beliefs stored at collection by those of the present filter, as on the page."""
     with set_recurrent_mode(True):
         filter(batch)
         for key in filter.carry_keys:
@@ -205,14 +205,14 @@ def filtered(filter, batch):
 
 
 def with_other_beliefs(data):
-    """As if the policy had believed something else while it collected."""
+    """Changes the beliefs stored at collection."""
     out = data.clone()
     out["belief"].apply_(lambda value: value.fill_(50.0))
     return out
 
 
 def sac(filter, *, inside, **options):
-    """SAC on what a filter believes; with the filter in the actor, or in front of it."""
+    """SAC on a filter's belief; with the filter in the actor, or in front of it."""
     head = nn.Sequential(nn.Linear(S, 2 * A), NormalParamExtractor())
     own = TensorDictModule(head, [MEAN], ["loc", "scale"])
     actor = ProbabilisticActor(
@@ -225,7 +225,7 @@ def sac(filter, *, inside, **options):
     return actor, head, options
 
 
-def test_sac_on_what_the_filter_believes_now(float64):
+def test_sac_on_recomputed_beliefs(float64):
     """Both losses written out, with the beliefs of each step by hand; what was stored must not matter."""
     filter, frames = filter_and_frames()
     data = collected(filter, frames)
@@ -257,7 +257,7 @@ def test_sac_on_what_the_filter_believes_now(float64):
 
 @pytest.mark.parametrize("vmap", [True, False])
 def test_sac_with_the_filter_in_the_critic_too(float64, vmap):
-    """``separate_losses`` alone leaves the filter its weights; otherwise torchrl draws a critic's weights anew."""
+    """``separate_losses`` alone leaves the filter its weights; otherwise torchrl draws a critic's weights again."""
     filter, frames = filter_and_frames()
     data = collected(filter, frames)
     actor, head, options = sac(filter, inside=True)

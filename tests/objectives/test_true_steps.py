@@ -1,4 +1,4 @@
-"""Tests what the transition gets where the state before is the true one; oracle: a transition that repeats it."""
+"""Inputs of the transition in steps from the true state; oracle: a transition that repeats its input."""
 
 import math
 
@@ -21,7 +21,7 @@ def _double(float64):
 
 
 class Repeats(SubModel):
-    """Writes what it reads, under another prefix."""
+    """Copies its inputs to another prefix."""
 
     def __init__(self, source, target):
         super().__init__(nn.Identity(), [(source, name) for name in NAMES], [(target, name) for name in NAMES])
@@ -31,7 +31,7 @@ class Repeats(SubModel):
 
 
 class Start(Initial):
-    """A belief of zeros, whose bias is one more than a mean that is there."""
+    """Initial belief of zeros, whose bias is the given mean plus one."""
 
     ensemble_size, state_dim = E, S
 
@@ -46,7 +46,7 @@ class Start(Initial):
 
 
 @pytest.mark.parametrize("stored", [False, True])
-def test_a_step_from_the_truth_is_from_the_truth_one_step_earlier(stored):
+def test_true_step_starts_from_the_previous_true_state(stored):
     filter = Filter(
         {"transition": Repeats("belief", "forecast"), "end": Repeats("forecast", "belief")}, initial=Start()
     )

@@ -78,7 +78,7 @@ SETTINGS = [
     ("MixtureLoss", {"component_std": [1.0] * 3, "dims": [0, 1]}, "component_std has one entry"),
     ("TransitionLoss", {"score": "nll"}, '"crps", "energy" or "mse"'),
     ("TransitionLoss", {"spread": -1.0}, "not negative"),
-    ("TransitionLoss", {"belief": "analysis"}, "Name the prefix"),
+    ("TransitionLoss", {"belief": "analysis"}, "Pass the prefix"),
 ]
 
 

@@ -14,7 +14,7 @@ DT = 0.1
 
 @cache
 def kalman_runs(batch=60, steps=80, lag=0):
-    """Sequences [batch, steps] of state [x, y, vx, vy], a third of the readings missing; smoothed, with a lag."""
+    """Returns sequences [batch, steps] of the state [x, y, vx, vy], with a third of the readings missing, smoothed."""
     F = torch.eye(4)
     F[0, 2] = F[1, 3] = DT
     H = torch.eye(2, 4)
@@ -26,7 +26,7 @@ def kalman_runs(batch=60, steps=80, lag=0):
 
 
 def ensemble_run(steps=40, members=19, seed=0):
-    """A belief of random members around a circle, with truth and mask; [steps]."""
+    """Returns a belief of random members around a circle, with truth and mask; [steps]."""
     rng = torch.Generator().manual_seed(seed)
     t = torch.arange(steps) * DT
     truth = torch.stack([t.cos(), t.sin(), t], -1)

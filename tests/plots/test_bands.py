@@ -19,7 +19,7 @@ def line(axes, label):
 
 
 def band(axes):
-    """Times, lower and upper edge [T], read from the polygon: start, lower edge, end, upper edge back."""
+    """Returns times, lower and upper edge [T] of the polygon: start, lower edge, end, upper edge back."""
     (polygon,) = axes.collections[0].get_paths()
     steps = (len(polygon.vertices) - 3) // 2
     lower = polygon.vertices[1 : 1 + steps]
@@ -86,7 +86,7 @@ def test_each_component_is_shaded_by_its_own_sensors_mask():
         plot_bands(run, observed={1: "imu"})
 
 
-def test_angles_stay_beside_the_mean():
+def test_angles_are_unwrapped_around_the_mean():
     rng = torch.Generator().manual_seed(0)
     theta = torch.linspace(0, 9, 30)
     wrap = wrap_angles
@@ -107,7 +107,7 @@ def spans(axes) -> list[tuple[float, float]]:
 
 
 def slow_sensor(lost: int) -> TensorDict:
-    """Five seconds at 100 Hz of a sensor at 1 Hz, of whose readings at 0.5, 1.5, ... s one is lost."""
+    """Returns five seconds at 100 Hz of a sensor at 1 Hz, of whose readings at 0.5, 1.5, ... s one is lost."""
     sequence = TensorDict({"belief": {"mean": torch.zeros(500, 1)}}, [500])
     sequence["observed"] = (torch.arange(500) % 100 == 50).unsqueeze(-1)
     sequence["observed"][50 + 100 * lost] = False

@@ -20,7 +20,7 @@ def _double(float64):
 
 
 def turning_run(spread=0.05):
-    """A body that turns about a tilted axis, more than once around; quaternions of either sign."""
+    """Returns a body that turns about a tilted axis, more than once around; quaternions of either sign."""
     rates = torch.tensor([0.03, -0.02, 0.12, 0.2, 0.1]).expand(STEPS, -1) * torch.arange(STEPS).unsqueeze(-1)
     truth = SPACE.plus(SPACE.exp(torch.tensor([0.3, 0.2, 2.0, 3.0, 1.0])), rates)
     ensemble = SPACE.plus(truth.unsqueeze(1), spread * torch.randn(STEPS, E, 5))
@@ -72,7 +72,7 @@ def test_a_wrap_is_drawn_as_a_wrap():
     assert min(turns[2:4]) > 1, "yaw and heading do"
 
 
-def test_the_ensembles_band_is_made_of_its_members_angles():
+def test_band_of_an_ensemble_uses_its_members_angles():
     run = turning_run()
     axes = plot_bands(run, space=SPACE, dims=[2])[0]
     _, low, high = band(axes)

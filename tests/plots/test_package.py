@@ -8,7 +8,7 @@ import torch
 import torch_denkf.plots as plots
 
 
-def test_what_is_missing_is_named_with_its_extra(monkeypatch, tmp_path):
+def test_missing_dependency_is_named_with_its_extra(monkeypatch, tmp_path):
     walk = torch.randn(5, 2)
     for module, extra, call in (
         ("matplotlib.figure", "plots", lambda: plots.plot_path(walk)),

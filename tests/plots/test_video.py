@@ -19,7 +19,7 @@ def smooth_frames(count=6, height=48, width=64):
 
 
 def decoded(file):
-    """Frames [T, H, W, 3] RGB, and frames a second."""
+    """Returns RGB frames [T, H, W, 3], and frames per second."""
     if file.suffix == ".gif":
         with Image.open(file) as gif:
             durations = []
@@ -55,7 +55,7 @@ def blue(frame):
     return frame[..., 2].astype(int) - frame[..., 0] > 30
 
 
-def test_the_belief_grows_beside_the_camera(tmp_path):
+def test_video_shows_belief_next_to_the_camera(tmp_path):
     run = ensemble_run(steps=20)
     run["observed"] = torch.arange(20).unsqueeze(-1) != 12
     run["pixels"] = torch.zeros(20, 3, 8, 16)

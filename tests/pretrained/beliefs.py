@@ -1,4 +1,4 @@
-"""Means and variances that each trained filter of the library believes after six steps of the same random readings."""
+"""Means and variances of each pretrained filter after six steps of the same random readings."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ _READINGS = {
 
 
 def all_beliefs():
-    """By name, the last mean and variance as one list."""
+    """Returns the last mean and variance of each filter, by name."""
     out = {}
     for name in torch_denkf.available():
         generator = torch.Generator().manual_seed(0)

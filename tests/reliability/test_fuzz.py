@@ -47,7 +47,7 @@ def _numbers(act=lambda value, folder: check_number("lags", value, least=5)):
     return Target("test", "number", ("lags",), act, d.Wrong({"four": 4}, d.drawn(st.integers(max_value=4))))
 
 
-def test_what_is_drawn_raises_and_the_same_each_time():
+def test_random_cases_raise_reproducibly():
     drawn = [search(_numbers().others(), 6, seed, "") for seed in (0, 0, 1)]
     assert {one["kind"] for rows in drawn for one in rows} == {"clear"}
     assert drawn[0] == drawn[1] != drawn[2]

@@ -11,7 +11,7 @@ MEAN, COV = [1.0, -1.0], [1.0, 2.0]  # of the first state, in tests.filters.fact
 
 
 def joint_beliefs(frames, lag=None):
-    """Means ``[B, T, S]`` and covariances ``[B, T, S, S]`` of the states given the readings up to t + lag.
+    """Returns means ``[B, T, S]`` and covariances ``[B, T, S, S]`` of the states given the readings up to t + lag.
 
     Args:
         frames: ``[B, T]`` with readings, masks of single components and beginnings of episodes, whose own frame is not
@@ -58,7 +58,7 @@ def _episode(frames, lag):
 
 
 def drive(rows, count, *, seed=0, missing=0.3, resets=True):
-    """Readings of the linear system, of which components are missing, NaN there, with beginnings inside."""
+    """Returns readings of the linear system, of which components are missing, NaN there, with beginnings inside."""
     F, Q, H, R = linear_system()
     generator = torch.Generator().manual_seed(seed)
 

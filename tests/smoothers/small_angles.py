@@ -18,7 +18,7 @@ def noise():
 
 
 def rotating():
-    """Motion, sensor, observation."""
+    """Returns the motion, sensor, observation."""
     return Turning(), None, Orientation()
 
 

@@ -37,7 +37,7 @@ def noisy(smoother, frames):
 
 @pytest.mark.parametrize("at_reset", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_episode_that_begins_within_the_lag_begins_anew(float64, kind, at_reset):
+def test_episode_start_within_the_lag_resets_the_clones(float64, kind, at_reset):
     smoother = KINDS[kind](toy_denkf(update_at_reset=at_reset))
     frames = toy_frames([2, 9], resets=False)
     frames["is_init"] = torch.zeros(2, 9, 1, dtype=torch.bool)
@@ -48,7 +48,7 @@ def test_an_episode_that_begins_within_the_lag_begins_anew(float64, kind, at_res
 
 
 @pytest.mark.parametrize("lag", [None, 2])
-def test_nothing_is_read_for_longer_than_the_lag(float64, lag):
+def test_gap_longer_than_the_lag(float64, lag):
     frames = drive(3, 14, missing=0.0, resets=False)
     frames["observed"][:, 4:11] = False
     frames["observation"][:, 4:11] = torch.nan
@@ -76,7 +76,7 @@ def test_a_lag_beyond_the_end_is_all_of_it(float64, smoother):
 
 
 @pytest.mark.parametrize("size", [2, 3, 7, 8])
-def test_members_that_are_all_alike_stay_what_they_are(float64, size):
+def test_identical_members_are_unchanged(float64, size):
     """Nothing can be learned without a spread; fewer members than dimensions take another path than more."""
     members = torch.randn(5).expand(size, 5).clone().requires_grad_()
     smoothed = enrts_step(members, 2 * members, 2 * members + 1)
@@ -121,16 +121,16 @@ WRONG = [
     (TypeError, "takes a filter with a mean and a covariance; DEnKF carries", RTSSmoother, linear_denkf),
     (TypeError, "takes a filter with particles", ParticleSmoother, linear_denkf),
     (TypeError, "density of the motion", ParticleSmoother, partial(bootstrap, 5)),
-    (ValueError, "picks none", partial(FixedLag, lag=2), partial(bootstrap, 5, resampling="transport")),
-    (TypeError, "carries a past already", partial(FixedLag, lag=2), lambda: FixedLag(linear_denkf(), 2)),
+    (ValueError, "picks no particles", partial(FixedLag, lag=2), partial(bootstrap, 5, resampling="transport")),
+    (TypeError, "already carries a lag window", partial(FixedLag, lag=2), lambda: FixedLag(linear_denkf(), 2)),
 ]
 
 
 @pytest.mark.parametrize(("error", "words", "smoother", "make"), WRONG)
-def test_what_cannot_be_smoothed_says_so(error, words, smoother, make):
+def test_unsupported_filters_raise(error, words, smoother, make):
     assert_raises(error, words, smoother, make())
 
 
-def test_a_belief_that_was_stored_without_a_lag_says_so():
+def test_stored_belief_without_a_lag_raises():
     stored = linear_denkf().sequence(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
     assert_raises(KeyError, "stored without a lag", FixedLag(linear_denkf(), 2).sequence, stored)

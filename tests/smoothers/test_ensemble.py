@@ -26,7 +26,7 @@ SMOOTHERS = {"EnKS": EnKS, "EnRTS": EnRTS}
 
 
 def large_filter(scheme, **kwargs):
-    """The linear system with so many members that sampling errors are small."""
+    """Returns the linear system with so many members that sampling errors are small."""
     prior = GaussianPrior(MEAN, torch.tensor(COV).sqrt(), ensemble_size=MEMBERS)
     return linear_denkf(scheme, noisy=True, initial=prior, **kwargs)
 
@@ -92,8 +92,8 @@ def test_step_by_step_is_the_recording(float64, scheme):
     assert_close(whole["belief", "ensemble"], filter.sequence(frames.copy())["belief", "ensemble"], rtol=0, atol=0)
 
 
-def test_rotations_turn_the_past_as_well(float64):
-    """Without process noise the rotated smoother keeps the exact moments, which a past left behind would not."""
+def test_rotation_applies_to_clones(float64):
+    """Without process noise the rotated smoother keeps the exact moments, which a lag window left behind would not."""
     filter = linear_denkf("etkf")
     rotated = linear_denkf("etkf")
     rotated["analysis"].rotate = True
@@ -105,8 +105,8 @@ def test_rotations_turn_the_past_as_well(float64):
     assert_raises(ValueError, "rotate=True", EnRTS, rotated)
 
 
-def test_several_analyses_each_correct_the_past(float64):
-    """Two readings one after the other are the two at once, for the past as for the present."""
+def test_several_analyses_correct_the_clones(float64):
+    """Two readings one after the other are the two at once, for the lag window as for the present."""
     both = linear_denkf("etkf")
     first = parts_of_reading(0, "forecast", "mid", observed_key="observed0")
     second = parts_of_reading(1, "mid", "belief", observed_key="observed1")
@@ -119,7 +119,7 @@ def test_several_analyses_each_correct_the_past(float64):
     assert_close(serial["smoothed", "var"], joint["smoothed", "var"], rtol=0, atol=1e-9)
 
 
-def test_inflation_leaves_the_past_alone(float64):
+def test_inflation_does_not_change_clones(float64):
     filter = linear_denkf("etkf")
     out = FixedLag(filter, 2).sequence(drive(2, 3, resets=False, missing=0.0))
     filter["analysis"].inflation = 1.5
@@ -129,7 +129,7 @@ def test_inflation_leaves_the_past_alone(float64):
     assert not torch.allclose(inflated["belief", "ensemble"][:, 1], out["belief", "ensemble"][:, 1])
 
 
-def test_damping_holds_the_inflation_that_goes_back(float64):
+def test_damping_limits_the_backward_inflation(float64):
     """One direction that is never read, inflated in each step: the way back multiplies it, unless it is damped."""
     members = torch.randn(6, 1)
     members = members - members.mean()
@@ -144,7 +144,7 @@ def test_damping_holds_the_inflation_that_goes_back(float64):
 
 @pytest.mark.parametrize("lag", [None, 1])
 def test_inflation_needs_a_damping(float64, lag):
-    """A direction that nobody reads: without a word the smoothed spread was that of the filter times the inflation."""
+    """In an unobserved direction the smoothed spread is not the filter's times the inflation."""
     frames = drive(2, 8, missing=0.0, resets=False)
     filter = DEnKF(
         NoisyLinear(torch.eye(2)),

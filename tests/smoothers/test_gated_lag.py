@@ -1,4 +1,4 @@
-"""Gates and lags in either order: what the gate rejects corrects neither the belief nor the past."""
+"""Gates and lags in either order: what the gate rejects corrects neither the belief nor the lag window."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ def off(frames, key="observation"):
 
 
 def hidden(frames, out, key="observed", gate="gate"):
-    """The recordings without what a gate rejected, which is more than what is wrong: it opens a little later."""
+    """Returns the recordings without the readings that the gate rejected, also good ones after a fault."""
     rejected = out[gate, "factor"].isinf()
     assert rejected[:, WRONG].all()
     assert rejected.sum() <= 4 * len(frames) * len(WRONG)
@@ -47,15 +47,15 @@ ORDERS = {
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("scheme", ["etkf", "sakov"])
-def test_what_is_rejected_is_as_good_as_hidden(float64, order, scheme):
+def test_rejected_equals_missing(float64, order, scheme):
     out = ORDERS[order](linear_denkf(scheme)).sequence(off(readings()))
     expected = FixedLag(linear_denkf(scheme), 4).sequence(hidden(readings(), out))
     for key in (("belief", "ensemble"), ("belief", "past"), ("smoothed", "ensemble")):
         assert_close(out[key], expected[key], rtol=1e-12, atol=1e-12)
 
 
-def test_a_reading_that_counts_less_corrects_the_past_less(float64):
-    """Student's t enlarges R: the past moves as with that R from the beginning."""
+def test_down_weighted_reading_corrects_clones_less(float64):
+    """Student's t enlarges R: the lag window moves as with that R from the beginning."""
     frames = off(readings())
     gated = ORDERS["gate outside"](linear_denkf()).gates[0]
     gated.response, gated.limits = "student", gated.limits / 1e3
@@ -98,7 +98,7 @@ def test_a_gate_of_late_readings_is_as_good_as_a_mask(float64):
         assert_close(out[key], expected[key], rtol=1e-12, atol=1e-12)
 
 
-def test_a_lag_keeps_what_a_gate_was_calibrated_to(float64):
+def test_lag_keeps_the_calibration_of_a_gate(float64):
     clean = TensorDict({"observation": torch.randn(4, 200, 2)}, [4, 200])
     options = {"response": "huber", "window": 2, "rate": 2e-3, "freedom": 5.0, "patience": 7, "by_component": True}
     options |= {"adapt_noise": 0.01, "adapt_inflation": 0.02, "gate_prefix": "door"}
@@ -111,7 +111,7 @@ def test_a_lag_keeps_what_a_gate_was_calibrated_to(float64):
     assert {name: getattr(inside, name) for name in options} == options
 
 
-def test_a_smoother_of_a_gated_filter_leaves_out_what_the_gate_rejects(float64):
+def test_smoother_excludes_rejected_readings(float64):
     gated = Gated(linear_denkf(), 2, **GATE)
     smoothed, out = EnKS(gated, lag=4)(off(readings())), gated.sequence(off(readings()))
     expected = EnKS(linear_denkf(), lag=4)(hidden(readings(), out))
@@ -141,8 +141,8 @@ def test_a_gate_opens_to_readings_of_an_ensemble_as_to_those_of_a_kalman_filter(
 
 
 @pytest.mark.parametrize("kind", ["Kalman", "ensemble"])
-def test_adapted_spread_raises_where_the_past_is_observed(float64, kind):
-    """It is inflation; around a filter without a past it is that of readings in their order."""
+def test_adapted_spread_with_observed_clones_raises(float64, kind):
+    """It is inflation; around a filter without a lag window it is that of readings in their order."""
     with pytest.raises(ValueError, match="Refiltering"):
         Gated(fused(kind, delay=3, members=torch.randn(7, 2)), adapt_inflation=0.1)
     if kind == "Kalman":

@@ -17,7 +17,7 @@ from torch_denkf.smoothers.particles import log_density_of_pairs
 
 
 def particles(size, *, control=None, **kwargs):
-    """The linear system; its noise is one that has a density."""
+    """Returns the linear system; its noise is one that has a density."""
     F, _, H, R = linear_system()
     return ParticleFilter(
         NoisyTransition(NoisyLinear(F, control=control), known_process_noise()),
@@ -45,7 +45,7 @@ def test_many_particles_are_the_exact_smoother(float64, lag):
     assert_close(out["smoothed", "log_weight"].exp().sum(-1), torch.ones(2, 7))
 
 
-def test_ancestors_of_many_particles_say_the_same_later(float64):
+def test_ancestors_of_many_particles_equal_the_exact_smoother(float64):
     frames, size = drive(2, 7), 2000
     mean, cov = joint_beliefs(frames, 2)
     with torch.no_grad():

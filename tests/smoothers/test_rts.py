@@ -49,7 +49,7 @@ def test_a_compiled_filter_is_compiled_once_for_sequences_of_any_length(float64,
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_online_lag_says_it_that_much_later(float64, name):
+def test_online_fixed_lag_equals_the_delayed_smoother(float64, name):
     lag, frames = 3, drive(4, 9)
     out = FixedLag(make(name), lag).sequence(frames.copy())
     age = out["smoothed", "age"].squeeze(-1)
@@ -62,7 +62,7 @@ def test_online_lag_says_it_that_much_later(float64, name):
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_an_update_at_the_first_frame_counts_for_the_past_too(float64, name):
+def test_update_at_reset_is_smoothed(float64, name):
     frames = drive(3, 6, resets=False, missing=0.0)
     filter = make(name)
     filter = filter.with_options(update_at_reset=True)
@@ -74,7 +74,7 @@ def test_an_update_at_the_first_frame_counts_for_the_past_too(float64, name):
 
 
 @pytest.mark.parametrize("name", ["EKF", "UKF", "BackpropKF"])
-def test_a_learned_filter_learns_from_what_it_looks_back_at(float64, name):
+def test_gradients_through_the_smoother(float64, name):
     filter, frames = learned_filter(name), learned_frames(3, 5)
     for smoother in (RTSSmoother(filter), FixedLag(filter, 2)):
         directional_check(
@@ -86,7 +86,7 @@ def test_a_learned_filter_learns_from_what_it_looks_back_at(float64, name):
 
 
 def unsure(name, dtype):
-    """A vehicle that knows its place to 1000 m, and reads it to 0.1 m; on a space its heading, too, to a few turns."""
+    """Returns a vehicle with a prior std of 1000 m and readings of 0.1 m; on a space also a heading."""
     dt, like = 0.1, {"dtype": dtype}
     if name == "SE2":
         motion = ConstantTwist(SE2(), dt, twist_noise=[0.05, 0.1, 0.1])
@@ -112,7 +112,7 @@ def unsure(name, dtype):
 
 @pytest.mark.parametrize("smoother", [RTSSmoother, partial(RTSSmoother, lag=5), partial(FixedLag, lag=5)])
 @pytest.mark.parametrize("name", ["Kalman", "EKF", "UKF", "SE2"])
-def test_a_start_that_is_far_less_sure_than_the_readings_stays_positive(name, smoother):
+def test_vague_prior_keeps_the_covariance_positive(name, smoother):
     time = 0.1 * torch.arange(30, dtype=torch.double)
     torch.manual_seed(0)
     place = torch.stack([700 + 3 * time, -400 - 2 * time], -1) + 0.1 * torch.randn(30, 2, dtype=torch.double)

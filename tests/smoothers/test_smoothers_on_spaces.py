@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def filter_of(kind, parts, own, std, q, space=None, reading_space=None, *, size=24, key="pose", **options):
-    """A filter of rotations, or of plain numbers."""
+    """Returns a filter of rotations, or of plain numbers."""
     around = AroundState(std, ensemble_size=size, state_key="start", space=space)
     known = {"process_noise": q, "observation_key": key, "reading_space": reading_space, **options}
     if kind in GAUSSIAN:

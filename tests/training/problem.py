@@ -14,7 +14,7 @@ from torch_denkf.training.logs import RunLogs
 
 
 def drives(count, steps, seed):
-    """States that drift with the action, measurements that mix them, ``[count, steps]``."""
+    """Returns states that drift with the action, measurements that mix them, ``[count, steps]``."""
     generator = torch.Generator().manual_seed(seed)
     action = torch.randn(count, steps, A, generator=generator)
     drift = torch.cat([action, action.sum(-1, keepdim=True)], -1)

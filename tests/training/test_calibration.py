@@ -32,7 +32,7 @@ def test_a_setting_that_fails_never_wins():
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_dimensions_are_held_each_by_itself_in_any_batch(batch):
+def test_coverage_of_each_dimension_in_any_batch(batch):
     values, seen = torch.randn(*batch, 7, 2), torch.rand(*batch, 7, 2) < 0.5
     start = torch.randn(*batch, 2)
     held = hold_last(values, seen, start)
@@ -49,7 +49,7 @@ def test_dimensions_are_held_each_by_itself_in_any_batch(batch):
             assert result == last
 
 
-def test_readings_that_are_not_accepted_are_not_held():
+def test_rejected_readings_are_not_held():
     values, seen = torch.tensor([[1.0], [9.0], [2.0]]), torch.ones(3, 1, dtype=torch.bool)
     held = hold_last(values, seen, torch.zeros(1), lambda step, last: (values[step] - last).abs() < 5)
     assert held.flatten().tolist() == [1.0, 1.0, 2.0]

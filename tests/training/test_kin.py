@@ -63,7 +63,7 @@ def test_another_delay_and_sensors_of_one_kind_by_their_names():
     assert not filter["a_sensor"].state_dict().keys() - source["a_sensor"].state_dict().keys()
 
 
-def test_what_took_nothing_is_named_and_what_is_not_clear_raises():
+def test_unmatched_weights_are_named_and_ambiguous_ones_raise():
     filter = ensemble(width=16)
     left = take_weights(filter, ensemble())
     assert left == [name for name, _ in filter.named_parameters() if "transition" in name]

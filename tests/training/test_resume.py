@@ -1,4 +1,4 @@
-"""Killed with SIGKILL and started again: every file is that of a training that was never broken off."""
+"""Killed with SIGKILL and started again: every file is that of a training that was never interrupted."""
 
 import os
 import subprocess
@@ -134,7 +134,7 @@ def test_a_second_trainer_raises(tmp_path):
 
 
 @pytest.mark.parametrize("resume", [True, False])
-def test_what_cannot_be_made_again_is_moved_and_not_deleted(tmp_path, resume, caplog):
+def test_irreproducible_files_are_moved_and_not_deleted(tmp_path, resume, caplog):
     make_trainer(tmp_path, updates=2).fit()
     before = {file.name: file.read_bytes() for file in tmp_path.glob("best_*.pt")}
     logs = csv_files(tmp_path)

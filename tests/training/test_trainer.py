@@ -38,7 +38,7 @@ def line_stage(net, name="fit", updates=6, spoil=(), **kwargs):
 
 
 def by_hand(stage, net, seed, number=0, spoil=()):
-    """The loop of examples/quickstart.py; returns the terms of every update."""
+    """Returns the loop of examples/quickstart.py; returns the terms of every update."""
     optimiser = torch.optim.AdamW(net.parameters(), lr=stage.lr, weight_decay=stage.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, stage.lr, total_steps=stage.updates)
     seen = []
@@ -58,7 +58,7 @@ def by_hand(stage, net, seed, number=0, spoil=()):
 
 
 @pytest.mark.parametrize("spoil", [(), (0,), (2, 3)])
-def test_it_is_the_loop_that_one_would_write(tmp_path, spoil, caplog):
+def test_trainer_equals_a_plain_loop(tmp_path, spoil, caplog):
     net, twin = nn.Linear(2, 1), nn.Linear(2, 1)
     twin.load_state_dict(net.state_dict())
     options = {"lr": 0.1, "weight_decay": 0.2, "clip": 0.5}
@@ -230,27 +230,25 @@ def test_hooks_of_torchrl(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")  # no bar where no terminal is
 
 
-OF_THE_TRAINER = {
-    "two stages of a name": ({"stages": 2}, "name of its own"),
-    "a logger": ({"loggers": ["wandb"]}, "Unknown logger 'wandb'"),
-    "what is kept": ({"keep": "first"}, "keep is"),
-    "no log": ({"log_every": 0}, "at least 1"),
-}
-OF_THE_LOSS = {
+LOSSES = {
     "no loss": (lambda net, x: {"error": net(x).mean()}, 'starts with "loss"'),
     "a loss of rows": (lambda net, x: {"loss": net(x)}, r"'loss' is \[8, 1\]"),
     "a loss of no parameter": (lambda net, x: {"loss": x.sum()}, "does not depend on the parameters"),
 }
 
 
-@pytest.mark.parametrize("what", [*OF_THE_TRAINER, *OF_THE_LOSS])
-def test_mistakes(what, tmp_path):
-    net, options = nn.Linear(2, 1), {"out": tmp_path, "device": "cpu", **OF_THE_TRAINER.get(what, ({},))[0]}
-    stages = [line_stage(net)] * options.pop("stages", 1)
-    if what in OF_THE_LOSS:
-        stages = [Stage("fit", lambda batch: OF_THE_LOSS[what][0](net, batch["x"]), stages[0].sample, 1)]
-    with pytest.raises(ValueError, match={**OF_THE_TRAINER, **OF_THE_LOSS}[what][1]):
-        FilterTrainer(net, stages, **options).fit()
+@pytest.mark.parametrize("what", LOSSES)
+def test_losses_that_are_none(what, tmp_path):
+    net, (loss, match) = nn.Linear(2, 1), LOSSES[what]
+    stage = Stage("fit", lambda batch: loss(net, batch["x"]), line_stage(net).sample, 1)
+    with pytest.raises(ValueError, match=match):
+        FilterTrainer(net, [stage], out=tmp_path, device="cpu").fit()
+
+
+def test_two_stages_of_a_name(tmp_path):
+    net = nn.Linear(2, 1)
+    with pytest.raises(ValueError, match="name of its own"):
+        FilterTrainer(net, [line_stage(net)] * 2, out=tmp_path, device="cpu")
 
 
 def test_a_monitor_that_is_not_validated(tmp_path):

@@ -14,7 +14,7 @@ STEPS = [3, 5]  # episode lengths of the two (or first two) rows
 
 
 def forked_env(workers, *args, **kwargs):
-    """A ``ParallelEnv`` of copies of this process: workers that need not import anything, which takes seconds."""
+    """Returns a ``ParallelEnv`` of forked workers, which need no imports and so start fast."""
     return ParallelEnv(workers, *args, mp_start_method="fork", **kwargs)
 
 
@@ -33,41 +33,41 @@ class Changed(Transform):
 
 
 def base_env(**kwargs):
-    """The system of :func:`linear_system` as an environment; emits "observation", "observed" and "state"."""
+    """Returns the system of :func:`linear_system` as an environment; emits "observation", "observed" and "state"."""
     F, Q, H, R = linear_system()
     return LinearGaussianEnv(F, H, Q.diagonal().sqrt(), R.sqrt(), **kwargs)
 
 
 def known_start_filter(**kwargs):
-    """A noisy ensemble filter whose prior has no spread: the belief after a reset is known exactly."""
+    """Returns a noisy ensemble filter whose prior has no spread: the belief after a reset is known exactly."""
     prior = GaussianPrior(PRIOR_MEAN, [0.0, 0.0], ensemble_size=6)
     return linear_denkf("perturbed", noisy=True, initial=prior, **kwargs)
 
 
 def half_known_filter(**kwargs):
-    """An ensemble filter whose prior has a spread in the second component alone."""
+    """Returns an ensemble filter whose prior has a spread in the second component alone."""
     prior = GaussianPrior(PRIOR_MEAN, [0.0, 1.0], ensemble_size=6)
     return linear_denkf("perturbed", noisy=True, initial=prior, **kwargs)
 
 
 def fixed_filter(**kwargs):
-    """An ensemble filter without any randomness."""
+    """Returns an ensemble filter without any randomness."""
     return linear_denkf("etkf", **kwargs)
 
 
 def random_filter(**kwargs):
-    """An ensemble filter with a random prior, random forecasts and random perturbations."""
+    """Returns an ensemble filter with a random prior, random forecasts and random perturbations."""
     prior = GaussianPrior(PRIOR_MEAN, [1.0, 1.0], ensemble_size=6)
     return linear_denkf("perturbed", noisy=True, initial=prior, **kwargs)
 
 
 def filtered_env(make_filter=known_start_filter, *, transform=None, **kwargs):
-    """The transform right on the environment."""
+    """Returns the transform right on the environment."""
     return TransformedEnv(base_env(**kwargs), DEnKFTransform(make_filter(), **(transform or {})))
 
 
 def toy_base_env(**kwargs):
-    """A stable system with S states, M measurements and A actions, for :func:`toy_denkf`."""
+    """Returns a stable system with S states, M measurements and A actions, for :func:`toy_denkf`."""
     generator = torch.Generator().manual_seed(0)
     matrix = 0.5 * torch.randn(S, S, generator=generator)
     return LinearGaussianEnv(
@@ -81,15 +81,15 @@ def toy_base_env(**kwargs):
 
 
 def toy_filter(**kwargs):
-    """Four learned sub-models that read "observation"."""
+    """Returns four learned sub-models that read "observation"."""
     return toy_denkf(in_key="observation", **kwargs)
 
 
 def seeded_env(seed, **kwargs):
-    """The plain environment, seeded: a worker's."""
+    """Returns the plain environment, seeded: a worker's."""
     return base_env(seed=seed, **kwargs)
 
 
 def random_rollout(env, steps=12):
-    """Random actions, over the ends of episodes."""
+    """Runs random actions across the ends of episodes."""
     return env.rollout(steps, break_when_any_done=False)

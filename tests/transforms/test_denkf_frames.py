@@ -56,7 +56,7 @@ def test_observed_nan_raises_and_names_the_key(make_base, make_filter):
     assert_equal(make(reject).rollout(8)["next"], make(honest=True).rollout(8)["next"], BELIEF)
 
 
-def test_divergence_is_told_apart():
+def test_divergence_message_names_the_cause():
     filter = linear_denkf()
     filter["transition"].matrix.mul_(1e30)
     env = TransformedEnv(base_env(), DEnKFTransform(filter))

@@ -1,4 +1,4 @@
-"""The belief of t - lag beside that of t, in environments: specs, workers, resets, and the smoother as the oracle."""
+"""The belief of t - lag next to that of t, in environments: specs, workers, resets, and the smoother as the oracle."""
 
 import pytest
 import torch
@@ -50,7 +50,7 @@ def controlled_env(**kwargs):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_the_past_knows_the_actions_that_led_to_it(workers):
+def test_clones_use_their_actions(workers):
     if workers:
         env = envs.forked_env(
             workers, controlled_env, create_env_kwargs=[{"max_steps": 4}, {"max_steps": 7, "seed": 1}]

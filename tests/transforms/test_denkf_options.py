@@ -93,7 +93,7 @@ def test_reset_mask_of_the_transform_alone(float64, shape):
 
 
 @pytest.mark.parametrize("resetting", [[], ["one"], ["two"], ["one", "two"]])
-def test_the_belief_starts_anew_where_any_group_does(float64, resetting):
+def test_belief_is_reset_with_any_group(float64, resetting):
     done = ["done", "terminated", "truncated"]
     groups = [RenameTransform(done, [(name, key) for key in done], create_copy=True) for name in ("one", "two")]
     env = TransformedEnv(envs.base_env(batch_size=[3]), Compose(*groups, DEnKFTransform(envs.known_start_filter())))
@@ -164,6 +164,6 @@ def test_a_part_of_a_belief_given_to_reset_raises(float64, given):
     env = env_with(linear_kalman())
     start = env.reset()
     lacking = ({"mean", "cov"} - {given}).pop()
-    with pytest.raises(KeyError, match=rf"reads \('belief', '{lacking}'\), which is missing.*a whole belief"):
+    with pytest.raises(KeyError, match=rf"reads \('belief', '{lacking}'\), which is missing.*a complete belief"):
         env.reset(start.select(("belief", given)))
     assert env.reset(start.set(MEAN, start[MEAN] + 1))[MEAN].equal(start[MEAN])

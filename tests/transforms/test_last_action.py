@@ -1,4 +1,4 @@
-"""The action that led to an observation: beside it, zero after a reset, in every kind of environment."""
+"""The action that led to an observation: in the same row, zero after a reset, in every kind of environment."""
 
 import torch
 from torchrl.envs import SerialEnv, TransformedEnv
@@ -8,7 +8,7 @@ from tests.transforms.envs_for_tests import base_env
 from torch_denkf.transforms import LastAction
 
 
-def test_it_is_the_action_before_and_zero_where_an_episode_begins(float64):
+def test_last_action_is_zero_after_a_reset(float64):
     frames = frames_for(["resets"])
     env = ReplayedFrames(frames)
     player = env.player()

@@ -51,7 +51,7 @@ def next_is_nan_where_done(data):
     return data["next", "observation"].isnan().equal(done) and int(data["next", "done"].sum()) == 6
 
 
-def test_in_an_environment_the_belief_begins_anew_with_the_simulators_own_reset(float64):
+def test_belief_is_reset_with_the_simulators_autoreset(float64):
     filter = linear_kalman()
     env = TransformedEnv(simulator(), InitTracker())
     env.append_transform(DEnKFTransform(filter))

@@ -23,7 +23,7 @@ def one_step(env, filter, without=()):
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory):
-    """Steps of a filter without randomness in a batch and of one with an action alone; not compiled: fast."""
+    """Returns steps of a filter without randomness in a batch and of one with an action alone; not compiled: fast."""
     folder, out = tmp_path_factory.mktemp("packages"), {}
     plain_toy = partial(toy_filter, sensor_layer="none", layer="none")
     cases = {"[3]": (base_env, fixed_filter, [3]), "action": (toy_base_env, plain_toy, [])}
@@ -65,7 +65,7 @@ def test_rollouts_over_resets_are_the_same(packages, name, store_ensemble):
     assert (("belief", "ensemble") in rollouts[1].keys(True)) == store_ensemble
 
 
-def test_the_package_is_what_runs(packages):
+def test_packaged_step_runs(packages):
     """And not the filter's own modules, of which the first raises."""
 
     def fail(*_):
@@ -84,7 +84,7 @@ def packaged_env(filter, step, batch_size=(), **options):
     return TransformedEnv(base_env(seed=0, batch_size=batch_size), DEnKFTransform(filter, packaged=step, **options))
 
 
-def test_what_went_wrong_is_said(packages, tmp_path):
+def test_mismatched_packages_raise(packages, tmp_path):
     filter, path, _, _ = packages["[3]"]
     step = load_step(path)
     with pytest.raises(KeyError, match="log_likelihood"):
@@ -107,7 +107,7 @@ def test_what_went_wrong_is_said(packages, tmp_path):
 
 
 @pytest.mark.parametrize("check", [True, False])
-def test_nan_is_found_unless_nobody_looks_for_it(packages, check):
+def test_nan_raises_unless_check_finite_is_off(packages, check):
     filter, path, _, _ = packages["[3]"]
     env = packaged_env(filter, load_step(path), batch_size=[3], check_finite=check)
     td = env.rand_action(env.reset())

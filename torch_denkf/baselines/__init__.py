@@ -1,4 +1,4 @@
-"""Baselines: what a filter of this library is compared with."""
+"""Baselines for comparison with the library's filters."""
 
 from torch_denkf.baselines.bkf import BackpropKF
 from torch_denkf.baselines.iterated import IEnKS

@@ -1,4 +1,4 @@
-"""The Backprop KF (Haarnoja et al. 2016): a Kalman filter behind a learned sensor that also says how sure it is."""
+"""The Backprop KF (Haarnoja et al. 2016): a Kalman filter with a learned sensor that also predicts its noise."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class BackpropKF(Filter):
     r"""Linear-Gaussian filter of :math:`x_t = A x_{t-1} + B a + N(0, Q)`, :math:`z_t = C x_t + N(0, R_t)`.
 
     A sensor network reads :math:`z_t` from the frame and a noise network :math:`R_t`; both are trained through the
-    filter's recursion. For a nonlinear motion, such as a vehicle's, give an :class:`~torch_denkf.filters.EKF` the
-    same sensor and noise modules; so for an orientation, which no matrix moves. The belief is that of
+    filter's recursion. For a nonlinear motion, such as a vehicle's, give an :class:`~torch_denkf.filters.EKF` the same
+    sensor and noise modules; likewise for orientations, for which no linear transition exists. The belief is that of
     :class:`~torch_denkf.filters.KalmanFilter`.
 
     Args:
         transition: A, ``[S, S]``.
-        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is :math:`z_t`; ``None`` where it is in
-            the tensordict, under ``observation_key``.
+        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is :math:`z_t`; ``None`` if the tensordict
+            has it under ``observation_key``.
         observation: C, ``[O, S]``.
         noise: writes R: variances (:class:`~torch_denkf.modules.DiagonalNoise`) or a covariance
             (:class:`~torch_denkf.modules.CholeskyNoise`), usually from the sensor's encoding.
@@ -39,10 +39,10 @@ class BackpropKF(Filter):
             :class:`~torch_denkf.modules.GaussianAround`.
         control: B, ``[S, A]``; ``None`` for none.
         trainable: whether A and B are parameters.
-        inflation: factor on the belief's standard deviations, where anything is observed.
+        inflation: factor on the belief's standard deviations, in elements with an observation.
         **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility`` and what every filter takes,
             see :class:`~torch_denkf.filters.parts.ReadingOptions`. Of ``control_keys`` the first drives the transition
-            where ``control`` is given.
+            if ``control`` is given.
 
     Raises:
         ValueError: if the shapes do not fit, or the state or the reading lives in a space.

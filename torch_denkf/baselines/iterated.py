@@ -1,4 +1,4 @@
-"""The iterated ensemble Kalman smoother as a filter: for steps that are strongly non-linear."""
+"""The iterated ensemble Kalman smoother as a filter, for strongly non-linear dynamics."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ __all__ = ["IEnKS"]
 
 
 class IEnKS(Filter):
-    """Iterated ensemble Kalman smoother: each reading corrects the state before the step, and the step is made again.
+    """Iterated ensemble Kalman smoother: each reading corrects the previous state, and the transition runs again.
 
-    Where a step bends much (long steps of a chaotic system, say), the linear update of an ensemble filter is a poor map
-    from readings to states. Here a few members suffice. Its belief of t is ``("belief", "ensemble")``, ``mean`` and
-    ``var``; that of t - 1, given the reading of t, stands under ``("smoothed", ...)``. Each step runs the transition
-    ``iterations + 2`` times.
+    Under strongly non-linear dynamics (long steps of a chaotic system, say), the linear update of an ensemble filter
+    is a poor map from readings to states. This smoother needs few members there. The belief of t is ``("belief",
+    "ensemble")``, ``mean`` and ``var``; the smoothed belief of t - 1, given the reading of t, is ``("smoothed",
+    ...)``. Each step runs the transition ``iterations + 2`` times.
 
     Args:
         transition: forecasts ``("forecast", "ensemble")``; deterministic.
-        sensor: writes the reading; ``None`` where it is in the tensordict, under ``observation_key``.
+        sensor: writes the reading; ``None`` if the tensordict has it under ``observation_key``.
         observation: writes ``("forecast", "observation")``; deterministic.
         noise: writes the reading's variances.
         initial: the initial belief, which also fixes the number of members.
-        iterations: of Gauss-Newton.
-        inflation: factor on the anomalies of the smoothed members, where anything is observed.
-        rotate: random mean-preserving rotation of them.
+        iterations: number of Gauss-Newton iterations.
+        inflation: factor on the anomalies of the smoothed members, in elements with an observation.
+        rotate: applies a random mean-preserving rotation to the anomalies.
         process_noise: Q of the motion: standard deviations ``[S]`` (a number for all), or a module that writes Q, see
             :mod:`torch_denkf.modules.process_noise`. ``None``: the motion is exact.
-        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``sensor_error`` and what every filter
-            takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`; no ``update_at_reset``, no ``visibility``.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``sensor_error`` and the options of every
+            filter, see :class:`~torch_denkf.filters.parts.ReadingOptions`; no ``update_at_reset``, no ``visibility``.
 
     Raises:
-        ValueError: if a model draws noise of its own, it is not clear where the reading is, or ``update_at_reset`` is
-            asked for: the first frame has no step before it.
+        ValueError: if transition or observation draws noise, the reading's key is ambiguous, or ``update_at_reset`` is
+            set: the first frame has no step before it.
 
     Reference:
         Bocquet & Sakov, "An iterative ensemble Kalman smoother", Q. J. R. Meteorol. Soc. 140, 2014, with a lag of one

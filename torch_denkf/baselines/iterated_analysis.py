@@ -1,4 +1,4 @@
-"""Transition, observation and analysis in one, repeated: the update of the iterated ensemble Kalman smoother."""
+"""Update of the iterated ensemble Kalman smoother, which repeats transition, observation and analysis."""
 
 from __future__ import annotations
 
@@ -64,29 +64,29 @@ def _twice(prefix: str, keys: Sequence[NestedKey], space: Space | None, belief: 
 
 
 class IteratedAnalysis(Rotated):
-    r"""Finds from where the reading says that the last step began, and makes the step again from there.
+    r"""Corrects the previous state by the reading, and repeats the step from there.
 
     Gauss-Newton steps in the space of the members, each with a run of transition and observation; see
-    :func:`~torch_denkf.baselines.iterated_smoothing.iterated_smoothing`. Where the motion has Gaussian noise, the
-    noise of each member is part of what is looked for (Sakov, Haussaire & Bocquet 2018).
+    :func:`~torch_denkf.baselines.iterated_smoothing.iterated_smoothing`. Gaussian process noise of each member is
+    estimated, too (Sakov, Haussaire & Bocquet 2018).
 
     Args:
         transition: forecasts ``("forecast", "ensemble")`` from ``("belief", "ensemble")``; deterministic, or a
             :class:`NoisyTransition` around a deterministic one.
         observation: observes the forecast, writes ``("forecast", "observation")``; deterministic.
-        iterations: of Gauss-Newton.
-        inflation: factor on the anomalies of the smoothed members, where anything is observed.
-        rotate: random mean-preserving rotation of them.
-        space: in which the state lives; ``None`` for plain numbers. Members are corrected as tangents at their mean.
-        reading_space: in which the reading lives; innovation and R are tangents.
+        iterations: number of Gauss-Newton iterations.
+        inflation: factor on the anomalies of the smoothed members, in elements with an observation.
+        rotate: applies a random mean-preserving rotation to the anomalies.
+        space: space of the state; ``None`` for vectors. Members are corrected as tangents at their mean.
+        reading_space: space of the reading; innovation and R are tangents.
         ensemble_key: members before the step, ``[*B, E, S]``.
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or one reading ``[*B, O]``.
         noise_variance_key: variances ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        belief_prefix: prefix of what is written of the new time: ``ensemble``, ``mean``, ``var``; of the time before
-            the same stand under ``"smoothed"``, with ``age`` ``[*B, 1]``, 1 step.
+        belief_prefix: prefix of the outputs at the new time, ``ensemble``, ``mean`` and ``var``; those at the previous
+            time are stored under ``"smoothed"``, with ``age`` ``[*B, 1]``, 1 step.
         info_prefix: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``, of the forecast
-            that has not seen the reading.
+            before the update.
 
     Raises:
         ValueError: if transition or observation draw other noise.
@@ -132,7 +132,7 @@ class IteratedAnalysis(Rotated):
         self.reading_keys = self.in_keys[1:3]
 
     def parts(self):
-        """Returns the transition, whose noise is looked for; the observation has none."""
+        """Returns the transition, whose noise is estimated; the observation has none."""
         return {"transition": self.module["transition"]}
 
     def on_entries(self, entries, call):
@@ -197,7 +197,7 @@ class IteratedAnalysis(Rotated):
         return noise
 
     def _after(self, smoothed, observed, rotation) -> torch.Tensor:
-        """Returns the smoothed members, inflated and rotated where anything was observed."""
+        """Returns the smoothed members, inflated and rotated in elements with an observation."""
         changed = self.rotated(inflate(smoothed, self.inflation) if self.inflation != 1.0 else smoothed, rotation)
         return changed if observed is None else torch.where(observed.any(-1)[..., None, None], changed, smoothed)
 

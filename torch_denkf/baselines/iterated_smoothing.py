@@ -1,7 +1,7 @@
-"""The iterated ensemble Kalman smoother: the step is repeated from where the reading says that it began.
+"""The iterated ensemble Kalman smoother, which repeats a step from the smoothed previous state.
 
-Where a step is strongly non-linear, one regression of readings on states is a poor map of the way back. Gauss-Newton
-steps in the space of the members draw a new one from the last estimate each time.
+In a strongly non-linear step, one regression of readings on states is a poor approximation. Gauss-Newton steps in the
+space of the members linearise again at the last estimate.
 
 Source: Bocquet & Sakov 2012 and 2014 (Q. J. R. Meteorol. Soc. 140), the "transform" version with one step of lag, which
 is the iterated ensemble Kalman filter of Sakov, Oliver & Bertino 2012.
@@ -27,22 +27,22 @@ def iterated_smoothing(
     observed: Tensor | None = None,
     iterations: int = 10,
 ) -> tuple[Tensor, Tensor]:
-    """Conditions an ensemble on a reading of what becomes of it.
+    """Conditions an ensemble on a reading after the next step.
 
     One iteration is the "etkf" analysis of the reading, applied to the members before the step.
 
     Args:
         ensemble: members before the step, ``[*B, E, S]`` with E >= 2.
-        predict: moves members one step (or several) on and observes them: ``[*B, E, S]`` to ``[*B, E, O]``. It is
-            called once an iteration, and must give the same for the same members.
+        predict: forecasts members by one step (or several) and observes them: ``[*B, E, S]`` to ``[*B, E, O]``. It is
+            called once per iteration, and must be deterministic.
         observation: the reading after the step, ``[*B, O]``.
-        noise: its variances R, ``[*B, O]``, positive.
-        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; False takes that component out. None: everything is observed.
-        iterations: of Gauss-Newton; 10 are enough for chaotic systems.
+        noise: variances R of the reading, ``[*B, O]``, positive.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; False for missing components. None: everything is observed.
+        iterations: number of Gauss-Newton iterations; 10 suffice for chaotic systems.
 
     Returns:
-        The smoothed members ``[*B, E, S]``; and what the first iteration predicted, ``[*B, E, O]``, of which
-        innovations are made. Where nothing is observed the members come back as they went in.
+        The smoothed members ``[*B, E, S]``; and the predictions of the first iteration, ``[*B, E, O]``, for
+        innovations. Members without an observation are returned unchanged.
 
     Raises:
         ValueError: if the shapes do not fit, or ``iterations`` is not positive.

@@ -1,4 +1,4 @@
-"""An LSTM as a filter: the baseline that has no model of motion, observation or noise, and must learn all of it."""
+"""An LSTM as a filter: the baseline without models of motion, observation or noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["LSTMFilter"]
 
 
 class LSTMFilter(Filter):
-    """A recurrent network that reads what a filter's sensor wrote and writes a Gaussian belief.
+    """A recurrent network that reads a sensor's outputs and writes a Gaussian belief.
 
     Its belief is ``("belief", "mean")`` ``[*B, S]``, ``("belief", "cov")`` (diagonal unless ``motion`` is given) and
     ``("belief", "var")``, and its memory ``("belief", "hidden")`` and ``("belief", "cell")`` ``[*B, num_layers,
@@ -28,27 +28,27 @@ class LSTMFilter(Filter):
     :class:`~torch_denkf.objectives.GaussianLoss` and ``transition=0``: it has no forecast, and no innovation.
 
     Args:
-        sensor: writes the encoding, or the reading, or both; ``None`` where they are in the tensordict. The *same*
-            sensor as that of the filter it is compared with makes the comparison fair.
-        features: size of the encoding at ``encoding_key``; 0 where the LSTM does not read it.
+        sensor: writes the encoding, or the reading, or both; ``None`` if the tensordict has them. For a fair
+            comparison, use the *same* sensor as the other filter.
+        features: size of the encoding at ``encoding_key``; 0 if the LSTM does not read it.
         state_dim: S.
         motion: a module that writes the belief from the last one, under ``"forecast"``, and the velocities that the
-            LSTM estimates, ``("velocity", "mean")`` and ``("velocity", "cov")``; it has ``velocity_dim``, their
-            number. Such is :class:`~torch_denkf.applications.car.modules.unicycle_pose.UnicyclePose` for a car.
-            ``None``: the LSTM estimates the whole state.
+            LSTM estimates, ``("velocity", "mean")`` and ``("velocity", "cov")``; it has ``velocity_dim``, their number;
+            e.g. :class:`~torch_denkf.applications.car.modules.unicycle_pose.UnicyclePose` for a car. ``None``: the LSTM
+            estimates the whole state.
         initial: the belief at reset, a mean and a covariance, e.g. :class:`~torch_denkf.modules.GaussianAround`; by
-            default ``N(loc, scale²)``, which is no state where ``motion`` is given.
-        loc: mean of what the LSTM estimates, ``[S]``, or one number a velocity with ``motion``; zero by default.
-        scale: its standard deviation; one by default.
+            default ``N(loc, scale²)``, which is not possible with ``motion``.
+        loc: mean of the LSTM's outputs, ``[S]``, or one per velocity with ``motion``; zero by default.
+        scale: standard deviation of the outputs; one by default.
         hidden_size: of each layer.
-        num_layers: of cells.
-        observation_dim: O, where the LSTM reads ``observation_key``.
+        num_layers: number of layers.
+        observation_dim: O, if the LSTM reads ``observation_key``.
         encoding_key: the sensor's encoding ``[*B, features]``; ``None`` for none.
-        observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; read where
+        observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; read if
             ``observation_dim`` is given.
         control_keys: see :class:`Filter`; give the action's key in ``extra_keys``, too.
         init_key: see :class:`Filter`.
-        update_at_reset: see :class:`Filter`; not with ``motion``: nothing moves into the first frame.
+        update_at_reset: see :class:`Filter`; not with ``motion``: no motion leads to the first frame.
         **kwargs: passed on to :class:`~torch_denkf.baselines.lstm_cell.LSTMUpdate`: ``extra_keys`` and
             ``extra_features``, ``floor``, ``observation_loc``, ``observation_scale``, ``observed_key``; and
             ``variance_ceiling``, ``check_finite`` and ``prefix`` of :class:`Filter`.

@@ -1,7 +1,7 @@
-r"""A recurrent network in a filter's place: it keeps a memory, and writes its belief as a Gaussian.
+r"""A recurrent network in place of a filter, with a hidden state as memory and a Gaussian belief.
 
-The baseline without any model: no motion, no noise, no gain, only a memory that is trained. It keeps the keys of the
-filters with a mean and a covariance, so that objectives, metrics and environments treat it as one of them.
+This baseline has no models and no gain. It uses the keys of the filters with a mean and a covariance, so that
+objectives, metrics and environments work unchanged.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["LSTMTransition", "LSTMUpdate", "with_memory"]
 
 _MEMORY = ("hidden", "cell")
 _MOMENTS = ("mean", "cov")
-_MOST_LAYERS = 1000  # more are a slip, and would be built one by one until memory ends
+_MOST_LAYERS = 1000  # more are a mistake, and would exhaust the memory
 
 
 def with_memory(
@@ -37,7 +37,7 @@ def with_memory(
         initial: the initial belief with a mean: :class:`MomentPrior`, :class:`GaussianAround`.
         hidden_size: H.
         num_layers: L.
-        belief_prefix: prefix of what is written: that of ``initial``, and ``hidden`` and ``cell`` ``[*B, L, H]``.
+        belief_prefix: prefix of the outputs of ``initial``, and of ``hidden`` and ``cell`` ``[*B, L, H]``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -57,7 +57,7 @@ def _empty(key: NestedKey, shape: tuple[int, int], belief: Entries, batch_size: 
 
 
 class LSTMTransition(Transition):
-    """Hands memory, mean and covariance of the last belief on: an LSTM has no forecast before it sees its input.
+    """Returns memory, mean and covariance of the last belief unchanged, as an LSTM has no forecast.
 
     Args:
         belief_prefix: prefix of ``hidden``, ``cell``, ``mean`` and ``cov`` of the last belief.
@@ -84,9 +84,9 @@ class LSTMTransition(Transition):
 class LSTMUpdate(Update):
     r"""Updates the memory; the belief is :math:`N(m + s \circ W h_t, s^2 \circ (\mathrm{softplus}(U h_t) + c))`.
 
-    The LSTM reads, in this order: the sensor's encoding, its reading in units of ``observation_scale``, a flag for
-    each component of the reading (or one for the frame) that is 1 where it was observed, and what ``extra_keys`` name.
-    What was not observed is zero. U starts at zero, so that the belief's standard deviation is ``scale`` at first.
+    The LSTM reads, in this order: the sensor's encoding, its reading in units of ``observation_scale``, a flag for each
+    component of the reading (or one for the frame) that is 1 where it was observed, and the entries of ``extra_keys``.
+    Missing components are zero. U is initialised to zero, for an initial standard deviation of ``scale``.
 
     Args:
         state_dim: S, the number of outputs.
@@ -94,19 +94,19 @@ class LSTMUpdate(Update):
         observation_dim: O, size of the reading, with ``observation_key``.
         extra_features: size of all entries of ``extra_keys`` together.
         hidden_size: H.
-        num_layers: L, of cells, each of which reads the hidden state of the one before.
+        num_layers: L, number of layers; each reads the hidden state of the previous one.
         loc: mean of each output ``[S]``, in the state's units; zero by default.
         scale: standard deviation of each output ``[S]``; one by default.
         floor: smallest variance c, in units of ``scale`` squared.
         inflation: factor on the belief's standard deviations; 1 for none.
         observation_loc: mean of each component of the reading ``[O]``; zero by default.
-        observation_scale: its standard deviation ``[O]``; one by default.
+        observation_scale: standard deviation of each component ``[O]``; one by default.
         encoding_key: the sensor's encoding ``[*B, features]``; ``None`` for none.
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; ``None`` for
             none.
         extra_keys: further inputs ``[*B, n]``, which are not masked, e.g. ``"steps"`` or ``"action"``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; what it hides may be NaN. The encoding counts as
-            observed where any component is.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; missing readings may be NaN. The encoding is observed if
+            any component is.
         forecast_prefix: prefix of ``hidden`` and ``cell`` of the last step.
         memory_prefix: prefix of ``hidden`` and ``cell`` ``[*B, L, H]``, written.
         belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``,

@@ -33,7 +33,7 @@ _DAY = 86400.0
 
 @dataclass
 class Cache(Command):
-    """List, check or clear what is kept of earlier runs: decoded pictures and optical flow."""
+    """List, check or clear the cache of earlier runs: decoded images and optical flow."""
 
     what: Positional[
         Literal["list", "check", "clear"]

@@ -32,7 +32,7 @@ class Command:
     Attributes:
         name: what comes after ``denkf``.
         example: one whole command line.
-        resumable: whether a repeated command goes on where an interrupted one stopped.
+        resumable: whether a repeated command continues where an interrupted one stopped.
         mistakes: further exceptions whose message is for the user.
         command_line: the words that were given, for the record.
 

@@ -22,7 +22,7 @@ __all__ = ["Log"]
 
 @dataclass
 class Log(Command):
-    """Say what is in a log: streams, rates, gaps, repeats, bursts, units, and delays between streams."""
+    """Report on a log: streams, rates, gaps, repeats, bursts, units, and delays between streams."""
 
     log: Positional[tuple[Path, ...]]  # text, Parquet, or ROS bags, of one clock
     time: str | None = None  # name of the column of times; found by usual names by default

@@ -63,7 +63,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return command.main(words[1:])
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,10 +1,9 @@
 """Compilation: a strategy that runs steps compiled, inductor's passes, tracing of packages, comparison with eager.
 
-It is the only room for torch's private names.
+Only this package uses torch's private names.
 
-A step is thirty kernels of a microsecond or two; so calling them, and what they save for the backward pass, must cost
-little. The passes make no result right that is wrong without them. They are used with the versions of torch that they
-were tested with; with others inductor runs as it is.
+A step is thirty kernels of a microsecond or two; so the overhead of calls and of saved tensors must be small. The
+passes only improve speed, not correctness. They are used only with the versions of torch that they were tested with.
 """
 
 from torch_denkf.compilation.captured import CapturedSteps as CapturedSteps

@@ -1,4 +1,4 @@
-"""Records steps, and their backward pass, in CUDA graphs: an eager step is a hundred launches, a replay is one."""
+"""Records steps, and their backward pass, in CUDA graphs: an eager step has a hundred launches, a replay one."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from torch_denkf.submodel import Call, Entries
 
 __all__ = ["CapturedSteps"]
 
-#: Runs before a recording: the first loads libraries, the second shows what waits for the device.
+#: Warm-up runs before a recording: the first loads libraries, the second detects synchronisations with the device.
 _WARM = 2
 
 
 class CudaRecorder:
-    """Records what a function launches, on one device."""
+    """Records the kernel launches of a function, on one device."""
 
-    #: One for each device: each has a workspace of cuBLAS.
+    #: One stream per device, as each has a workspace of cuBLAS.
     streams: ClassVar[dict[torch.device, Any]] = {}
 
     def __init__(self, device: torch.device):
@@ -41,7 +41,7 @@ class CudaRecorder:
 
     @contextmanager
     def _prepared(self) -> Iterator[None]:
-        """Leaves out MAGMA, which allocates memory and waits; draws of the runs inside leave no trace."""
+        """Avoids MAGMA, which allocates memory and synchronises, and restores the state of the random generators."""
         library = torch.backends.cuda.preferred_linalg_library()
         torch.backends.cuda.preferred_linalg_library("cusolver")
         try:
@@ -51,7 +51,7 @@ class CudaRecorder:
             torch.backends.cuda.preferred_linalg_library(library)
 
     def waits(self, run: Callable) -> list[str]:
-        """Runs a function, and lists the lines of code in which it waits for the device."""
+        """Runs a function, and lists the lines of code that synchronise with the device."""
         before = torch.cuda.get_sync_debug_mode()
         with self._prepared(), warnings.catch_warnings(record=True) as said:
             self.stream.wait_stream(torch.cuda.current_stream(self.device))
@@ -65,16 +65,16 @@ class CudaRecorder:
                     finally:
                         torch.cuda.set_sync_debug_mode(before)
             torch.cuda.current_stream(self.device).wait_stream(self.stream)
-        # Turning the mode on warns, too, once in a process.
+        # Enabling the mode itself warns once per process.
         return sorted({f"{w.filename}:{w.lineno}" for w in said if "called a synchronizing" in str(w.message)})
 
     def record(self, run: Callable) -> Callable:
-        """Returns a function that replays what ``run`` launches, and returns the tensors that it returned."""
+        """Returns a function that replays the launches of ``run``, and returns its tensors."""
         graph = torch.cuda.CUDAGraph()
         context = {"pool": self.pool, "stream": self.stream, "capture_error_mode": "thread_local"}
         with _no_collection(), self._prepared(), torch.cuda.graph(graph, **context):
             results = run()
-        self.pool = graph.pool()  # the backward pass reads what the forward pass saved there
+        self.pool = graph.pool()  # the backward pass reads tensors that the forward pass saved there
 
         def replay() -> Any:
             graph.replay()
@@ -85,7 +85,7 @@ class CudaRecorder:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Keeps the garbage collector from freeing an older graph, which would spoil the recording of a new one."""
+    """Keeps the garbage collector from freeing an older graph during a recording, which would break it."""
     gc.collect()
     enabled = gc.isenabled()
     gc.disable()
@@ -99,13 +99,14 @@ def _no_collection() -> Iterator[None]:
 class CapturedSteps(CompiledSteps):
     """Runs steps and sequences as CUDA graphs; on other devices eagerly, with one warning.
 
-    A replay reads the inputs from memory of its own and writes to memory of its own, so both are copied. Graphs are
-    recorded for each kind of call, and again where parameters move or modules change between training and evaluation.
-    A number that is no tensor, such as an inflation, is the one of the recording.
+    A replay reads and writes static memory, so that inputs and outputs are copied. Graphs are recorded for each kind of
+    call, and again after parameters move or modules switch between training and evaluation. Python numbers, such as an
+    inflation, are constants of the recording.
 
     Args:
         chunk: steps of a sequence in one graph; ``None`` for all.
-        options: ``mode="graph"``; with others of ``torch.compile``, it compiles one step, and graphs hold that.
+        options: ``mode="graph"``; with further options of ``torch.compile``, one step is compiled, and the graphs
+            record it.
     """
 
     made, maker = "recorded", "CUDA's graphs"
@@ -145,17 +146,17 @@ class CapturedSteps(CompiledSteps):
 
 
 class Unchecked(CompiledSteps):
-    """Compiled steps whose results are compared elsewhere."""
+    """Compiled steps without a comparison of the results."""
 
     def _checked(self, device: torch.device) -> bool:
         return False
 
 
 class StepByStep(NamedTuple):
-    """One compiled step, called in a loop: a recording needs no longer function, whose compiling takes minutes.
+    """One compiled step, called in a loop: compiling a longer function would take minutes.
 
     Attributes:
-        compiled: the function.
+        compiled: compiled functions.
         steps: eager steps.
     """
 
@@ -164,7 +165,7 @@ class StepByStep(NamedTuple):
 
     @property
     def structure(self) -> Structure:
-        """Returns the filter's."""
+        """Returns the filter's structure."""
         return self.steps.structure
 
     def step(self, entries: Entries, call: Call) -> Entries:
@@ -173,7 +174,7 @@ class StepByStep(NamedTuple):
             return self.compiled.step(self.steps, entries, call.batch_size)
 
     def scan(self, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
-        """Takes one step after the other, all of one kind: where one may reset rows, each may."""
+        """Takes steps sequentially, all of the same kind: if one may reset rows, all may."""
         time, outputs = len(call.batch_size), []
         for t, cut in enumerate(cuts):
             carry = {key: of_one_kind(value.detach() if cut else value) for key, value in carry.items()}
@@ -194,19 +195,19 @@ def _at(entries: Entries, time: int, t: int) -> Entries:
 
 
 def _backward_again() -> AbstractContextManager:
-    """Keeps what a compiled backward pass reads: warm runs and the recording read it, one after the other."""
+    """Keeps the inputs of a compiled backward pass, for warm-up runs and the recording."""
     import torch._functorch.config as config
 
     return config.patch(donated_buffer=False)
 
 
 class Captured:
-    """A function of tensors, recorded at its first call of a kind, and replayed.
+    """A function of tensors that is recorded at its first call of a kind, and then replayed.
 
     Args:
-        function: takes and returns tensors, in tuples or not.
-        modules: whose parameters and buffers it reads.
-        recorder: makes an object that records, see :class:`CudaRecorder`.
+        function: takes and returns nested tuples of tensors.
+        modules: modules whose parameters and buffers it reads.
+        recorder: constructor of a recorder, see :class:`CudaRecorder`.
     """
 
     def __init__(self, function: Callable, modules: Sequence[nn.Module], recorder: Callable):
@@ -215,7 +216,7 @@ class Captured:
         self.graphs: dict[tuple, list[Graph] | None] = {}
 
     def __call__(self, *inputs: Any) -> Any:
-        """Replays a graph that no pending backward pass needs; records one where there is none."""
+        """Replays a graph that no pending backward pass needs; records one if there is none."""
         values = list(tensors(inputs))
         state = [value for part in self.modules for value in _own_tensors(part)]
         gradients = torch.is_grad_enabled() and any(value.requires_grad for value in (*values, *state))
@@ -243,13 +244,13 @@ class Captured:
 class Graph:
     """One recording of a function for inputs of one kind, with its backward passes.
 
-    Each set of outputs that get a gradient has a backward pass of its own, recorded when it is first needed.
+    For each set of outputs with a gradient, a backward pass is recorded when it is first needed.
     """
 
     def __init__(self, function: Callable, inputs: Any, modules: Sequence, recorder: Any, gradients: bool):
         self.recorder, self.gradients = recorder, gradients
         self.inputs = [value.detach().clone().requires_grad_(value.requires_grad) for value in tensors(inputs)]
-        # Writing to these does not count as a change of what autograd saved.
+        # Autograd does not track writes to these.
         self.written = [value.data for value in self.inputs]
         self.originals: list[Tensor] = []
         aliases = self._aliases(modules)
@@ -272,7 +273,7 @@ class Graph:
         self._holder: Callable = lambda: None
 
     def _aliases(self, modules: Sequence[nn.Module]) -> list[tuple[dict, dict]]:
-        """Makes other tensors in the memory of parameters and buffers, which an optimiser's change does not mark."""
+        """Creates aliases of parameters and buffers, whose versions an optimiser's update does not increase."""
         known: dict[int, Tensor] = {}
         for part in modules:
             for value in part._parameters.values():
@@ -287,7 +288,7 @@ class Graph:
         return [(table, {name: known.get(id(value)) for name, value in table.items()}) for table in tables]
 
     def pending(self) -> bool:
-        """Tells whether the backward pass of the last call may still come."""
+        """Returns True if the backward pass of the last call may still run."""
         holder = self._holder()
         if holder is None:
             return False
@@ -303,7 +304,7 @@ class Graph:
 
     @torch.no_grad()
     def forward(self, values: Sequence[Tensor]) -> list[Tensor]:
-        """Replays the forward pass; returns copies of what it wrote."""
+        """Replays the forward pass; returns copies of its outputs."""
         _copy(self.written, values)
         self.layout = self.replay()
         self.outputs = list(tensors(self.layout))
@@ -342,7 +343,7 @@ class Graph:
 
 
 class Replay(torch.autograd.Function):
-    """Shows a recorded function to autograd."""
+    """Registers a recorded function with autograd."""
 
     @staticmethod
     def forward(ctx: Any, graph: Graph, *values: Tensor) -> tuple[Tensor, ...]:
@@ -350,7 +351,7 @@ class Replay(torch.autograd.Function):
         ctx.graph = graph
         ctx.set_materialize_grads(False)
         out = graph.forward(values[: len(graph.inputs)])
-        ctx.save_for_backward(out[0].new_empty(0))  # gone once a backward pass needs no more of this call
+        ctx.save_for_backward(out[0].new_empty(0))  # freed by the backward pass of this call
         graph._holder = weakref.ref(ctx)
         pairs = zip(out, graph.outputs, strict=True)
         ctx.mark_non_differentiable(*(copy for copy, value in pairs if not value.requires_grad))
@@ -372,7 +373,7 @@ def _own_tensors(part: nn.Module) -> Iterator[Tensor]:
 
 @contextmanager
 def _in_place(aliases: Sequence[tuple[dict, dict]]) -> Iterator[None]:
-    """Puts aliases in the place of parameters and buffers."""
+    """Replaces parameters and buffers by aliases."""
     before = [(table, dict(table)) for table, _ in aliases]
     try:
         for table, others in aliases:
@@ -403,14 +404,14 @@ def _warn_of(waits: Sequence[str], what: str) -> None:
 
 
 def strategy(chunk: int | None, options: dict[str, Any]) -> CompiledSteps | InTime:
-    """Returns the strategy that :meth:`torch_denkf.filters.Filter.compile` asks for.
+    """Returns the strategy for the arguments of :meth:`torch_denkf.filters.Filter.compile`.
 
     Args:
         chunk: steps of a sequence in one graph; ``None`` for the strategy's default.
         options: of ``torch.compile``, or ``mode="graph"``, or ``mode="in time"``.
 
     Raises:
-        ValueError: if ``chunk`` is no number of steps.
+        ValueError: if ``chunk`` is negative or no whole number.
     """
     if chunk is not None:
         check_count("chunk", chunk, least=0, cure="It is a number of steps, or 0 for none")

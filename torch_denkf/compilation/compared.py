@@ -1,4 +1,4 @@
-"""A compiled function next to the eager one, once: a compiler may be wrong, and say nothing."""
+"""Compares a compiled function with the eager one, as compilers may be silently wrong."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 __all__ = ["check_same_numbers", "placed", "put_back", "tensors"]
 
-#: Roundings by which two orders of the same sums may differ: of the largest number in a column, and in an entry.
+#: Allowed rounding errors of reordered sums: relative to the largest value of a column, and of an entry.
 _OF_COLUMN, _OF_ENTRY = 1000, 10
-#: Roundings by which inputs are changed to see what that does to the eager result, and how often at most.
+#: Perturbation of inputs in rounding errors, to measure the eager function's sensitivity; largest number of trials.
 _NUDGE, _NUDGES = 8, 32
 
 
@@ -32,41 +32,41 @@ def check_same_numbers(
     cure: str,
     maker: str = "torch's compiler",
 ) -> None:
-    """Raises unless a compiled function returns what it returns eagerly, up to rounding.
+    """Raises unless a compiled function returns the eager result, up to rounding.
 
-    Both run on the inputs as they are. Where a frame is hidden, or nothing but zero, both run again with numbers in it:
-    an update by zero, or by nothing, is right whatever the gain. Where one is not finite, they run on numbers alone.
-    NaN in both is equal.
+    Both run on the given inputs. If a frame is missing, or entirely zero, both run again with random numbers in it, as
+    an update by zero does not test the gain. If an input is not finite, they run only on random numbers. NaN in both is
+    equal.
 
-    How far rounding goes depends on the filter: a variance that a reading makes 1e6 times smaller loses six digits, and
-    a particle filter draws another particle. So it is measured. Where the results differ in more than their last
-    digits, the eager function runs on inputs that differ in theirs, and draws other numbers, if it draws any. The
-    compiled result may be twice as far off.
+    The effect of rounding depends on the filter: a variance that a reading reduces by 1e6 loses six digits, and a
+    particle filter may draw another particle. So it is measured: if the results differ in more than their last digits,
+    the eager function also runs on inputs with perturbed last digits, and with other random numbers, if it draws any.
+    The compiled result may differ twice as much.
 
     Args:
-        compiled: takes ``inputs``, and returns tensors, in tuples or not.
-        eager: the same.
-        inputs: tensors, ``None``, or tuples of them. What takes their place has their shapes, strides and need of
-            gradients, so that nothing is compiled again.
-        names: of the tensors in ``inputs``, in their order.
-        outputs: names of the tensors that are returned, in their order.
-        frames: names of inputs that may be any number: readings, actions, masks.
-        parameters: by name; if given, the gradient of the outputs, in one direction, by these and by the frames is
-            compared, too. Where there is no backward pass yet, one is compiled.
-        state: buffers that the function may change, such as running means; they are as they were after each run.
-        what: what is compared with the eager code, for the message.
+        compiled: takes ``inputs``, and returns nested tuples of tensors.
+        eager: the same function, eagerly.
+        inputs: tensors, ``None``, or tuples of them. Replacements have the same shapes, strides and ``requires_grad``,
+            so that nothing is compiled again.
+        names: names of the tensors in ``inputs``, in their order.
+        outputs: names of the returned tensors, in their order.
+        frames: names of inputs with arbitrary values: readings, actions, masks.
+        parameters: parameters by name; if given, a directional gradient of the outputs with respect to these and the
+            frames is compared, too. This may compile a backward pass.
+        state: buffers that the function may change, such as running means; they are restored after each run.
+        what: name of the compiled code, for the message.
         cure: what to do, for the message.
         maker: whose error a difference is, for the message.
 
     Raises:
-        RuntimeError: if they are farther apart; names the output that is farthest, and by how much.
+        RuntimeError: if they differ more; the message names the output with the largest difference.
     """
     given = list(tensors(inputs))
     free = [name in frames for name in names]
     telling = [_telling(value) if may else value for value, may in zip(given, free, strict=True)]
     labels, by, trained = [repr(name) for name in outputs], [], {}
     if parameters is not None and torch.is_grad_enabled():
-        # Not by beliefs: of a covariance one triangle may be read, or the other.
+        # Not with respect to beliefs: either triangle of a covariance may be read.
         by = [index for index, value in enumerate(given) if value.requires_grad and free[index]]
         trained = {name: value for name, value in parameters.items() if value.requires_grad}
         labels += [f"gradient by {name!r}" for name in [names[index] for index in by]]
@@ -81,7 +81,7 @@ def check_same_numbers(
             put_back(kept)
 
     same = all(one is other for one, other in zip(given, telling, strict=True))
-    finite = all(bool(value.isfinite().all()) for value in given)  # of NaN times zero a compiler may make zero
+    finite = all(bool(value.isfinite().all()) for value in given)  # a compiler may simplify NaN times zero to zero
     for values in [given] if same else [given, telling] if finite else [telling]:
         ours, theirs = run(compiled, values), run(eager, values)
         off, allowed = list(map(_distance, ours, theirs)), _last_digits(theirs, len(outputs))
@@ -106,7 +106,7 @@ def check_same_numbers(
 
 
 def put_back(kept: Sequence[tuple[Tensor, Tensor]]) -> None:
-    """Gives tensors their values back; those that have not changed are not written, as a graph may hold them."""
+    """Restores the values of tensors; unchanged ones are not written, as a graph may have saved them."""
     with torch.no_grad():
         for value, before in kept:
             if not torch.equal(value, before):
@@ -123,7 +123,7 @@ def tensors(value: Any) -> Iterator[Tensor]:
 
 
 def placed(like: Any, values: Iterator[Tensor]) -> Any:
-    """Returns tensors in place of those in nested tuples."""
+    """Replaces the tensors in nested tuples."""
     if isinstance(like, Tensor):
         return next(values)
     return tuple(placed(part, values) for part in like) if isinstance(like, tuple) else like
@@ -137,7 +137,7 @@ def _results(
     parameters: Sequence[Tensor],
     seed: int,
 ) -> list[Tensor]:
-    """Clones the results of a function, and its gradients by some of the ``values`` and ``parameters``."""
+    """Returns clones of a function's results, and its gradients with respect to some ``values`` and ``parameters``."""
     copies = {id(value): value.detach().requires_grad_() for value in values if value.requires_grad}
     leaves = [copies.get(id(value), value) for value in values]
     places = iter(leaves)
@@ -155,13 +155,13 @@ def _results(
 
 
 def _waves(value: Tensor) -> Tensor:
-    """Numbers between -1 and 1, as many and of the kind of a tensor's."""
+    """Returns fixed numbers between -1 and 1, in the shape and dtype of a tensor."""
     numbers = torch.arange(1, value.numel() + 1, dtype=torch.float64).sin()
     return numbers.reshape(value.shape).to(value.device, value.dtype)
 
 
 def _telling(value: Tensor) -> Tensor:
-    """Returns a frame that an update answers to, laid out as the given one; the given one if it is such a frame."""
+    """Returns a frame with finite nonzero values in the layout of the given one; the given one if it has them."""
     if value.dtype == torch.bool:
         known, numbers = value, torch.ones_like(value)
     elif value.is_floating_point():
@@ -175,14 +175,15 @@ def _telling(value: Tensor) -> Tensor:
         return value
     if known.all():
         return value
-    one = [slice(0, 1) if stride == 0 else slice(None) for stride in value.stride()]  # written to once
+    # expanded dimensions are written once
+    one = [slice(0, 1) if stride == 0 else slice(None) for stride in value.stride()]
     new = torch.where(known, value.detach(), numbers)[*one]
     out = torch.empty_strided(new.shape, value.stride(), dtype=value.dtype, device=value.device)
     return out.copy_(new).expand(value.shape).requires_grad_(value.requires_grad)
 
 
 def _nudged(value: Tensor, step: float, seed: int) -> Tensor:
-    """Changes the last digits of numbers."""
+    """Perturbs the last digits of values."""
     if not value.is_floating_point():
         return value
     noise = torch.randn(value.shape, generator=torch.Generator().manual_seed(seed)).to(value)
@@ -190,7 +191,7 @@ def _nudged(value: Tensor, step: float, seed: int) -> Tensor:
 
 
 def _distance(one: Tensor, other: Tensor) -> Tensor:
-    """Computes the distance of two tensors in each column, infinite where one of them is NaN."""
+    """Returns the distance of two tensors in each column; infinite if only one of them is NaN."""
     one, other = one.cpu().double(), other.cpu().double()
     same = (one == other) | (one.isnan() & other.isnan())
     return _columns(torch.where(same, 0.0, (one - other).abs().nan_to_num(nan=torch.inf)))
@@ -219,7 +220,7 @@ def _fits(off: Iterable[Tensor], allowed: Iterable[Tensor]) -> bool:
 
 
 class _Precision(TorchDispatchMode):
-    """Finds the coarsest rounding among all that is computed."""
+    """Finds the coarsest rounding among all operations."""
 
     coarsest = 0.0
 
@@ -232,7 +233,7 @@ class _Precision(TorchDispatchMode):
 
 
 def _coarsest_rounding(run: Callable, *args: Any) -> float:
-    """Returns the rounding of the coarsest numbers that are computed, such as those of a trunk in bfloat16."""
+    """Returns the coarsest rounding of all operations, such as that of a trunk in bfloat16."""
     with _Precision() as mode:
         run(*args)
     products = 0.0 if torch.get_float32_matmul_precision() == "highest" else torch.finfo(torch.bfloat16).eps

@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 __all__ = ["CompiledSteps", "filled", "of_one_kind"]
 
 _LOG = logging.getLogger("torch_denkf")
-#: Seconds of silence of a first call.
+#: Seconds before a first call logs a message.
 PATIENCE = 2.0
 
-#: Where an episode goes on, among the names of what a chunk takes. It is compared like a frame's mask: where the first
-#: call resets all rows, nothing of the transition would show.
+#: Name of the mask of continuing episodes, among the inputs of a chunk. It is compared like an observed mask: a first
+#: call that resets all rows would not test the transition.
 _GOES_ON = ("start", "goes on")
 
 
 class CompiledSteps:
     """Compiled functions of one filter, one for each kind of call: entries, batch size, number of steps.
 
-    Neither pickled nor copied with the filter: a worker compiles its own.
+    They are neither pickled nor copied with the filter: workers compile again.
 
     Args:
         chunk: steps of a sequence in one graph.
@@ -58,7 +58,7 @@ class CompiledSteps:
         self._functions: dict[tuple, tuple[Callable, set]] = {}
 
     def _compiler_options(self) -> dict[str, Any] | None:
-        """Returns the arguments of ``torch.compile``; ``None`` where nothing is compiled."""
+        """Returns the arguments of ``torch.compile``; ``None`` if nothing is compiled."""
         return self.options
 
     def _by_inductor(self) -> bool:
@@ -73,20 +73,20 @@ class CompiledSteps:
         return BoundSteps(self, filter, filter.steps if steps is None else steps)
 
     def step(self, steps: Steps, entries: Entries, batch_size: torch.Size) -> Entries:
-        """Takes one step; ``entries`` hold its noise."""
+        """Takes one step; ``entries`` include its noise."""
         keys, writes = tuple(entries), tuple(steps.structure.out_keys)
         make = partial(_step, steps, keys, writes, batch_size)
         values = self._call(("step", keys, batch_size), steps, make, tuple(entries.values()), keys, writes)
         return dict(zip(writes, values, strict=True))
 
     def scan(self, steps: Steps, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
-        """Returns what :meth:`Steps.scan` does, in chunks; all noise is among the inputs."""
+        """Returns the result of :meth:`Steps.scan`, in chunks; all noise is among the inputs."""
         time, batch, count = len(call.batch_size), call.batch_size, len(cuts)
         keys, start_keys, length = tuple(inputs), tuple(starts), self._length(count)
         whole, named = count, {**inputs}
         if resets is not None:
-            # One graph for all chunks: each step may reset rows, and what is left over is a chunk whose last steps are
-            # of no use. They begin again, so that no number of theirs grows without bound.
+            # One graph serves all chunks: each step may reset rows, and the last chunk is padded by unused steps. These
+            # are resets, so that their values stay bounded.
             whole = -(-count // length) * length
             named |= {
                 _GOES_ON: filled(~resets, time, count, True),
@@ -117,15 +117,15 @@ class CompiledSteps:
         """Runs the compiled function of a kind; on a miss, compiles it and compares it with the eager one.
 
         Args:
-            kind: tells the function from others of the same modules and tensors.
-            steps: the filter's.
+            kind: key that distinguishes the function from others of the same modules and tensors.
+            steps: the filter's steps.
             make: returns the function to compile.
-            inputs: what it takes.
-            names: of the tensors in ``inputs``.
+            inputs: inputs of the function.
+            names: names of the tensors in ``inputs``.
             writes: names of the tensors that it returns.
 
         Raises:
-            RuntimeError: if it does not return what it returns eagerly.
+            RuntimeError: if its result differs from the eager one.
         """
         some = next(tensors(inputs))
         device = some.device
@@ -133,7 +133,7 @@ class CompiledSteps:
         if kind not in self._functions:
             self._functions[kind] = self._made(make, steps, device), set()
         function, compared = self._functions[kind]
-        mode = torch.is_grad_enabled(), some.dtype  # torch.compile compiles again for each
+        mode = torch.is_grad_enabled(), some.dtype  # torch.compile recompiles for each
         if mode not in compared and self._checked(device) and has_values(some):
             what = f"{self.made} {'step' if kind[0] == 'step' else 'sequence'}"
             with said_when_long(
@@ -146,7 +146,7 @@ class CompiledSteps:
                     names=names,
                     outputs=writes,
                     frames=_frames(steps, names),
-                    # Who records gradients of single steps seldom wants them; a backward pass takes long to compile.
+                    # Gradients of single steps are seldom used, and a backward pass takes long to compile.
                     parameters=None if kind[0] == "step" else _parameters(steps),
                     state=[value for _, module in steps.structure.modules for value in module.buffers()],
                     what=what,
@@ -162,17 +162,17 @@ class CompiledSteps:
         function = make()
         if self._by_inductor():
             clear_damaged_libraries()
-        # A code object of its own: dynamo counts recompilations by code, and gives up after a few.
+        # A separate code object: dynamo counts recompilations by code object, and gives up after a few.
         code = function.__code__.replace(co_name=f"{function.__name__}_{len(self._functions)}")
         own = FunctionType(code, function.__globals__, function.__name__, None, function.__closure__)
         return torch.compile(own, fullgraph=True, dynamic=False, **self._arguments(device))
 
     def _checked(self, device: torch.device) -> bool:
-        """Tells whether results are compared with eager ones."""
+        """Returns True if results are compared with eager ones."""
         return True
 
     def _overwrites(self, device: torch.device) -> bool:
-        """Tells whether outputs lie in memory that the next call uses again: that of CUDA graphs."""
+        """Returns True if the next call overwrites outputs, as with CUDA graphs."""
         graphs = self.options.get("mode") in ("reduce-overhead", "max-autotune")
         graphs = graphs or self.options.get("backend") == "cudagraphs"
         graphs = graphs or (self.options.get("options") or {}).get("triton.cudagraphs", False)
@@ -186,11 +186,11 @@ class CompiledSteps:
 
 
 class BoundSteps(NamedTuple):
-    """A filter's steps as compiled functions take them; noise is drawn outside of the graph.
+    """Compiled steps of a filter; noise is drawn outside of the graph.
 
     Attributes:
-        compiled: the functions.
-        filter: draws the noise.
+        compiled: compiled functions.
+        filter: filter that draws the noise.
         steps: eager steps, which are compiled.
     """
 
@@ -204,13 +204,13 @@ class BoundSteps(NamedTuple):
         return self.compiled.step(self.steps, {**entries, **noise}, call.batch_size)
 
     def scan(self, *args: Any) -> tuple[Entries, Entries]:
-        """Takes one step after the other, see :meth:`torch_denkf.filters.scan.Steps.scan`."""
+        """Takes steps sequentially, see :meth:`torch_denkf.filters.scan.Steps.scan`."""
         return self.compiled.scan(self.steps, *args)
 
 
 @contextmanager
 def said_when_long(text: str) -> Iterator[None]:
-    """Logs what is done where it takes longer than :data:`PATIENCE` seconds."""
+    """Logs a task that takes longer than :data:`PATIENCE` seconds."""
     timer = Timer(PATIENCE, _LOG.warning, (text,))
     timer.daemon = True
     timer.start()
@@ -221,18 +221,18 @@ def said_when_long(text: str) -> Iterator[None]:
 
 
 def of_one_kind(value: Tensor) -> Tensor:
-    """Lays a belief out as any step's, with a gradient as any step's: torch.compile compiles again for another."""
+    """Normalises memory layout and ``requires_grad`` of a belief, as torch.compile recompiles for others."""
     free = torch.is_grad_enabled() and value.is_floating_point() and not value.requires_grad
     return _laid_out(value.detach().requires_grad_() if free else value)
 
 
 def _laid_out(value: Tensor) -> Tensor:
-    """Orders strides by dimension, for the same reason; dimensions along which nothing changes take no memory."""
+    """Makes a tensor contiguous, for the same reason, unless it has expanded dimensions."""
     return value if 0 in value.stride() else value.contiguous().view(value.shape)
 
 
 def _pieces(value: Tensor, time: int, length: int, whole: int, mark: bool) -> Sequence[Tensor]:
-    """Splits a value ``[*B, T, ...]`` into chunks, all laid out alike, however long the sequence is."""
+    """Splits a value ``[*B, T, ...]`` into chunks with a layout that does not depend on T."""
     value = filled(value, time, whole, False if mark else None)
     if 0 not in value.stride():
         value = _laid_out(value.movedim(time, 0)).movedim(0, time)
@@ -240,7 +240,7 @@ def _pieces(value: Tensor, time: int, length: int, whole: int, mark: bool) -> Se
 
 
 def filled(value: Tensor, time: int, count: int, fill: bool | None = None) -> Tensor:
-    """Continues a value ``[*B, T, ...]`` to ``count`` steps, with its last one where it is not said what with."""
+    """Pads a value ``[*B, T, ...]`` to ``count`` steps, by default with its last one."""
     lack = count - value.shape[time]
     if lack <= 0:
         return value

@@ -1,9 +1,9 @@
-"""Filtering and smoothing of all times at once: an associative scan, of which the levels are log2 T, not the steps T.
+"""Parallel-in-time filtering and smoothing by an associative scan, with log2 T levels instead of T steps.
 
-The Rauch-Tung-Striebel step to t is affine: the smoothed mean is E m + g of that of t + 1, the covariance E P Eᵀ + L.
-Two such steps are one, so pairs of steps are joined, and pairs of pairs. All work is in products of batches. So is a
-step of a Kalman filter an element: the Gaussian of the state given the one before and the reading, and what the reading
-says of the one before.
+The Rauch-Tung-Striebel step to t is affine in the smoothed moments m and P of t + 1: the mean is E m + g, the
+covariance E P Eᵀ + L. Two such steps compose to one, so pairs of steps are joined, then pairs of pairs. All work is in
+batched products. A step of a Kalman filter is such an element, too: the Gaussian of the state given the previous state
+and the reading, and the likelihood of the previous state.
 
 Source: Särkkä & García-Fernández 2021, IEEE T-AC 66.
 """
@@ -39,7 +39,7 @@ def prefixes(join: Callable[[_Elements, _Elements], _Elements], elements: _Eleme
     """Returns e_0, e_0 e_1, e_0 e_1 e_2, ... of an associative product.
 
     Args:
-        join: the product of elements ``[N, ...]``, those before and those behind them.
+        join: product of elements ``[N, ...]``: earlier ones, later ones.
         elements: ``[T, ...]``, in one tensor or several.
 
     Example:
@@ -70,19 +70,18 @@ def rts_in_time(
     *,
     follows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Does what :func:`~torch_denkf.functional.smoothing.rts.rts_smooth` does for plain numbers and all later readings.
+    """Smooths like :func:`~torch_denkf.functional.smoothing.rts.rts_smooth`, for vectors and a fixed interval.
 
-    It takes three times the arithmetic of one step after the other, and one call for each level in the place of one for
-    each step.
+    It needs three times the arithmetic of sequential steps, and one call for each level instead of one for each step.
 
     Args:
-        mean: of the filter's beliefs, ``[*B, T, S]``.
+        mean: means of the filter's beliefs, ``[*B, T, S]``.
         cov: their covariances, ``[*B, T, S, S]``.
-        forecast_mean: of each time, ``[*B, T, S]``.
+        forecast_mean: forecast of each time, ``[*B, T, S]``.
         forecast_cov: its covariance, ``[*B, T, S, S]``.
-        cross: covariance of the state before and the state at each time, ``[*B, T, S, S]``.
-        open_cov: of the step to each time, ``[*B, T, S, S]``.
-        follows: which elements are a step on from those before them, ``[*B, T]``; ``None`` for all.
+        cross: cross-covariance of the previous state and the state at each time, ``[*B, T, S, S]``.
+        open_cov: see :func:`~torch_denkf.functional.smoothing.rts.rts_smooth`, ``[*B, T, S, S]``.
+        follows: mask of elements that are one step after their predecessor, ``[*B, T]``; ``None`` for all.
 
     Returns:
         The smoothed means ``[*B, T, S]`` and covariances ``[*B, T, S, S]``.
@@ -112,7 +111,7 @@ def _backwards(value: Tensor, time: int) -> Tensor:
 
 
 def _one_after_the_other(later: Sequence[Tensor], earlier: Sequence[Tensor]) -> _Elements:
-    """Joins steps back in time; nothing of what is later, NaN neither, passes the end of an episode."""
+    """Combines steps backward in time; nothing, not even NaN, passes the end of an episode."""
     (gain, shift, rest, ends), (own_gain, own_shift, own_rest, own_ends) = later, earlier
     moved, left = own_gain @ shift + own_shift, own_gain @ rest @ own_gain.mT + own_rest
     return (
@@ -124,10 +123,10 @@ def _one_after_the_other(later: Sequence[Tensor], earlier: Sequence[Tensor]) -> 
 
 
 class InTime:
-    """A strategy for long logs of a :class:`~torch_denkf.filters.KalmanFilter`: sequences take all times at once.
+    """Strategy for long logs of a :class:`~torch_denkf.filters.KalmanFilter`: filters all times in parallel.
 
-    Where that does not hold, steps are taken one after the other: where back-propagation is truncated, in a policy's
-    data, or where a variance reaches the filter's ceiling.
+    Steps are sequential if back-propagation is truncated, in a policy's data, or if a variance reaches the filter's
+    ceiling.
 
     Args:
         options: ``mode="in time"``.
@@ -144,11 +143,11 @@ class InTime:
         """Returns the filter's steps.
 
         Raises:
-            TypeError: if its motion, its reading or its noises are not constant matrices.
+            TypeError: if its transition, observation model or noise covariances are not constant matrices.
         """
         steps = filter.steps if steps is None else steps
         transition, updates = steps.structure.transition[1], [module for _, module in steps.structure.update]
-        # No subclass and no other wrapper: what they change is not in the matrices.
+        # No subclass and no other wrapper, which may change more than the matrices.
         motion = transition.module if type(transition) is CrossTransition else transition
         (update,) = updates if len(updates) == 1 else (None,)
         linear = type(motion) is LinearTransition and isinstance(motion.noise, Tensor)
@@ -163,12 +162,12 @@ class InTime:
 
 
 class StepsInTime(NamedTuple):
-    """The steps of one filter; a single step is taken as it is.
+    """Parallel-in-time sequences of one filter, and its unchanged single steps.
 
     Attributes:
-        steps: of the filter.
-        motion: F, B and Q.
-        update: H and R.
+        steps: steps of the filter.
+        motion: transition with F, B and Q.
+        update: analysis with H and R.
     """
 
     steps: Steps
@@ -180,13 +179,13 @@ class StepsInTime(NamedTuple):
         return self.steps.step(entries, call)
 
     def scan(self, carry, inputs, call: Call, resets, starts, cuts, keep) -> tuple[Entries, Entries]:
-        """Returns what :meth:`Steps.scan` does: the beliefs of all times, and then each step from the one before."""
+        """Returns the result of :meth:`Steps.scan`: the beliefs of all times, then each step from its predecessor."""
         structure, time, count = self.steps.structure, len(call.batch_size), len(cuts)
         given = carry, inputs, call, resets, starts, cuts, keep
         if any(cuts) or FROM_STORED in inputs:
             return self.steps.scan(*given)
         row = {key: value.select(time, 0) for key, value in inputs.items()}
-        self.steps.step({**row, **carry}, call, frames=False)  # its modules say what is wrong with a reading
+        self.steps.step({**row, **carry}, call, frames=False)  # the modules raise for invalid readings
         begin = None
         if resets is not None:
             resets = filled(resets, time, count, False)
@@ -210,7 +209,7 @@ class StepsInTime(NamedTuple):
         return last, {key: out[key] for key in keep}
 
     def _elements(self, inputs: Entries, time: int, resets: Tensor | None, begin: Sequence[Tensor] | None):
-        """Returns A, b, C, eta, J and where nothing goes on, ``[*B, T, ...]``."""
+        """Returns A, b, C, eta, J and the mask of resets, ``[*B, T, ...]``."""
         move, q, matrix, r = self.motion.matrix, self.motion.noise, self.update.matrix, self.update.noise
         reading = inputs[self.update.in_keys[2]]
         if reading.ndim > time + 2:
@@ -230,7 +229,7 @@ class StepsInTime(NamedTuple):
         away = plain.unsqueeze(-1) - h_seen @ drift.unsqueeze(-1)
         spread = h_seen @ q @ h_seen.mT + r_seen
         gain = solve_for_gain(spread, h_seen @ q, plain)[0]
-        told = solve_for_gain(spread, h_seen @ move, plain)[0]  # of the state before
+        told = solve_for_gain(spread, h_seen @ move, plain)[0]  # for the previous state
         keep = torch.eye(len(q), dtype=q.dtype, device=q.device) - gain @ h_seen
         values = [keep @ move, drift.unsqueeze(-1) + gain @ away, keep @ q, told @ away, told @ h_seen @ move]
         ends = torch.zeros(*size[:-1], 1, 1, dtype=torch.bool, device=reading.device)
@@ -245,7 +244,7 @@ class StepsInTime(NamedTuple):
 
 
 def _one_step_more(before: Sequence[Tensor], behind: Sequence[Tensor]) -> _Elements:
-    """Joins steps of a Kalman filter; nothing of what was before a reset, NaN neither, goes on behind it."""
+    """Combines steps of a Kalman filter; nothing, not even NaN, passes a reset."""
     (move, mean, cov, told, known, ends), (own_move, own_mean, own_cov, own_told, own_known, own_ends) = before, behind
     inverse = torch.linalg.inv(torch.eye(move.shape[-1], dtype=move.dtype, device=move.device) + cov @ own_known)
     on, back = own_move @ inverse, move.mT @ inverse.mT

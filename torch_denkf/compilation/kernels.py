@@ -1,7 +1,7 @@
-"""Kernels of a compiled step: products that take longer to call than to compute are written out.
+"""Writes out small matrix products of a compiled step, whose call takes longer than their arithmetic.
 
-A product of small matrices takes a microsecond, and two more for the library around it. What inductor writes itself
-runs in one kernel with what comes before and after.
+A product of small matrices takes a microsecond, plus two for the library call. Inductor fuses written-out products with
+the operations before and after.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ __all__ = ["FewCalls", "insert_call"]
 
 aten = torch.ops.aten
 
-#: Multiplications for one matrix of a batch, up to which inductor's own loop takes its place (measured: 128 and 320).
+#: Largest number of multiplications per matrix of a batch for inductor's loop (measured: 128 and 320).
 SMALL = 1024
-#: A product of so few rows with one matrix is written out up to so many multiplications.
+#: Largest number of rows, and of multiplications, of a written-out product with one matrix.
 FEW_ROWS, SMALL_OF_ROWS = 8, 2**15
 
 
@@ -38,8 +38,8 @@ class FewCalls(CustomGraphPass):
 def part_bias(graph: Graph) -> None:
     """Adds the bias of a linear layer after the product, in the kernel of the activation.
 
-    The library's product with bias first copies the bias to every row of its result. A sum of a product of batches is
-    taken apart, too, so that the product can be written out.
+    The library's product with bias first copies the bias to every row of its result. Batched products with a sum are
+    also split, so that the product can be written out.
     """
     for node in graph.find_nodes(op="call_function", target=aten.baddbmm.default):
         (other, left, right), factors = node.args, node.kwargs
@@ -61,7 +61,7 @@ def part_bias(graph: Graph) -> None:
 def write_out_products(graph: Graph) -> None:
     """Writes products of tiny matrices, and of few rows with a matrix, as sums of products.
 
-    The former are covariances with two observed numbers, in batches; the latter are layers of a network on one robot.
+    The former are covariances of two observed components, in batches; the latter are layers of a network for one robot.
     """
     for target in (aten.bmm.default, aten.mm.default):
         for node in graph.find_nodes(op="call_function", target=target):

@@ -1,7 +1,7 @@
-"""Libraries in inductor's cache: those that a killed compilation, or a full disk, left unfinished are removed.
+"""Removes incomplete libraries in inductor's cache, from killed compilations or a full disk.
 
-Inductor's linker writes them in their place, and inductor takes what is there: without this, each later compilation
-fails with "file too short" until someone deletes the cache.
+Inductor's linker does not write them atomically: otherwise each later compilation fails with "file too short" until the
+cache is deleted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HEADER, _64_BITS = 64, 2  # bytes of ELF's header; its class
 
 
 def free_space(folder: Path) -> str:
-    """Returns how much a user may still write to a folder, or to the nearest one above that is there.
+    """Returns the free space of a folder, or of its nearest existing parent, as text.
 
     Example:
         >>> free_space(Path("/"))
@@ -39,13 +39,13 @@ def free_space(folder: Path) -> str:
 
 
 def clear_damaged_libraries(cache: Path | None = None) -> list[Path]:
-    """Removes unfinished libraries that nobody is writing, so that they are compiled again.
+    """Removes incomplete libraries that no process is writing, so that they are compiled again.
 
     Args:
         cache: folder of inductor's cache; by default the one in use.
 
     Returns:
-        What was removed; a line in the log names each.
+        Removed files; the log names each.
     """
     if not sys.platform.startswith("linux"):
         return []
@@ -61,10 +61,10 @@ def clear_damaged_libraries(cache: Path | None = None) -> list[Path]:
 
 @contextmanager
 def clear_full_cache() -> Iterator[None]:
-    """Says so if a compilation fails because the disk of inductor's cache is full.
+    """Raises a clear error if a compilation fails because the disk of inductor's cache is full.
 
     Raises:
-        OSError: naming the cache and the free space.
+        OSError: the message names the cache and the free space.
     """
     try:
         yield
@@ -86,7 +86,7 @@ def _cache_in_use() -> Path:
 
 
 def is_whole(library: Path) -> bool:
-    """Tells whether a file is a library (ELF, 64 bits) that reaches to the end of what its header announces."""
+    """Returns True if a file is a complete library (ELF, 64 bits), by the length in its header."""
     with library.open("rb") as stream:
         header, size = stream.read(_HEADER), os.fstat(stream.fileno()).st_size
         if len(header) < _HEADER or header[:4] != b"\x7fELF":
@@ -114,7 +114,7 @@ def _remove(library: Path, locks: Path) -> bool:
     if held is None:
         return False
     try:
-        if is_whole(library):  # by now
+        if is_whole(library):  # compiled meanwhile
             return False
         library.unlink()
         return True

@@ -1,7 +1,7 @@
-"""Locks that end with the process that holds them, however it ends.
+"""File locks that end with their process, also after a kill.
 
-The library filelock makes the file that it is asked about. Whoever sweeps what killed processes left must not: a folder
-without its lock would look as if it were in use.
+The library filelock creates the lock file when checking it. The sweep of temporary folders must not: a folder without a
+lock would then look as if it were in use.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ def take_lock(file: Path, *, create: bool = True) -> int | None:
     """Takes the lock of a file without waiting.
 
     Args:
-        file: what is locked.
-        create: whether the file may be made.
+        file: the lock file.
+        create: whether to create the file.
 
     Returns:
-        A file descriptor, whose closing ends the lock; None while another one holds it, and without the file.
+        A file descriptor, which releases the lock when closed; None while another process holds the lock, and without
+        the file.
 
     Raises:
-        OSError: if the file cannot be opened, or its file system knows no locks.
+        OSError: if the file cannot be opened, or its file system has no locks.
     """
     try:
         descriptor = os.open(file, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if create else 0), 0o644)
@@ -39,7 +40,7 @@ def take_lock(file: Path, *, create: bool = True) -> int | None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.path.samestat(os.fstat(descriptor), os.stat(file)):
             return descriptor
-    except (BlockingIOError, FileNotFoundError):  # another one holds it, or has just removed it
+    except (BlockingIOError, FileNotFoundError):  # another process holds it, or has just removed it
         pass
     except BaseException:
         os.close(descriptor)
@@ -53,13 +54,13 @@ def locked(folder: Path, name: str, doing: str) -> Iterator[None]:
     """Locks a folder for this process, until the block or the process ends.
 
     Args:
-        folder: made where it is not there.
-        name: of the file that is the lock; it goes with it.
-        doing: what holders of the lock do in the folder, for the message: ``"is writing to it"``.
+        folder: created if it does not exist.
+        name: name of the lock file, which is removed at the end.
+        doing: activity of the lock's holder, for the message: ``"is writing to it"``.
 
     Raises:
-        OSError: if another process holds the lock, or the folder cannot be written to; names the folder and the
-            process.
+        OSError: if another process holds the lock, or the folder cannot be written to; the message names the folder and
+            the process.
 
     Example:
         >>> import tempfile

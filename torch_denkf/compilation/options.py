@@ -1,4 +1,4 @@
-"""Options of ``torch.compile`` for small steps, and what torch checks before each call."""
+"""Options of ``torch.compile`` for small steps, and a filter of its guards."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def options_for_processors() -> dict[str, Any]:
                 "post_grad_custom_post_pass": FewCalls(),
                 "_post_fusion_custom_pass": ShortFunctions(),
                 "guard_filter_fn": worth_checking,
-                # Otherwise ten programs are compiled to see what the compiler knows of this processor.
+                # Otherwise ten test programs are compiled to detect vector instructions.
                 "cpp.vec_isa_ok": True,
             }
         except ImportError as error:
@@ -48,10 +48,11 @@ def options_for_processors() -> dict[str, Any]:
 
 
 def worth_checking(guards: Sequence) -> list[bool]:
-    """Chooses what torch.compile checks before each call: all that a user may change; all takes longer than a step.
+    """Selects the guards of torch.compile for values that a user may change; all guards take longer than a step.
 
-    Tensors (also parameters: their type, whether they are trained), types, numbers and names that modules hold stay.
-    What torch and this package define, a module's keys (part of what a function is kept under) and hooks do not.
+    Guards of tensors (also of parameters: dtype and ``requires_grad``), types, numbers and names in modules are kept.
+    Guards of definitions in torch and this package, of a module's keys (part of the cache key) and of hooks are
+    dropped.
     """
 
     def may_change(guard) -> bool:
@@ -67,13 +68,13 @@ def worth_checking(guards: Sequence) -> list[bool]:
     return [may_change(guard) for guard in guards]
 
 
-#: What the compiled functions close over, and never changes.
+#: Constant closure variables of the compiled functions.
 _CLOSED_OVER = ("writes", "batch", "cuts", "keep", "keys", "start_keys", "steps")
-#: Attributes that hold the names of entries.
+#: Attributes with keys of entries.
 _KEYS = frozenset({"in_keys", "_in_keys", "out_keys", "_out_keys_apparent", "optional_keys", "reading_keys", "_wants"})
-#: Where a filter's structure holds modules; all else in it are names.
+#: Attributes of a filter's structure with modules; all others have names.
 _MODULES = (["frames"], ["transition"], ["update"], ["posterior"])
-#: What is looked up in classes.
+#: Prefixes of guards on classes.
 _OF_CLASSES = ("dict(type(", "dict(G[", "type(")
 
 
@@ -81,7 +82,7 @@ def need_compiler() -> None:
     """Checks that inductor finds a C++ compiler.
 
     Raises:
-        RuntimeError: if it does not; the message says what to install.
+        RuntimeError: if there is none; the message says what to install.
     """
     from torch._inductor.cpp_builder import get_cpp_compiler
     from torch._inductor.exc import InvalidCxxCompiler

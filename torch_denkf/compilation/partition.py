@@ -1,8 +1,8 @@
 """Partition of a chunk into forward and backward for torch.compile, with few saved tensors.
 
-A step of small networks leaves two dozen small tensors for its backward pass. Each costs a few microseconds more than
-its numbers do: an allocation, a Python object, and autograd's records. So tensors of one shape go as one. The inputs of
-a layer in all steps of a chunk then stand in one matrix, and the gradient of its weights is one product.
+A step of small networks saves two dozen small tensors for its backward pass. Each has an overhead of a few
+microseconds: an allocation, a Python object, and autograd's records. So tensors of the same shape are concatenated. The
+inputs of a layer in all steps of a chunk are then one matrix, and the gradient of its weights is one product.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["FewSavedTensors"]
 
 aten = torch.ops.aten
 
-#: Bytes of a tensor from which on it stays alone: copying it takes about as long as an object of its own.
+#: Bytes from which a tensor is not concatenated, as copying it costs about as much as the overhead.
 LARGE = 2**15
 
 
@@ -33,7 +33,7 @@ class FewSavedTensors(CustomPartitionerFn):
 
     def __call__(self, gm: GraphModule, joint_inputs: Sequence[object], **fields: Any) -> tuple[GraphModule, ...]:
         """Splits a joint graph; ``fields`` are the default partitioner's."""
-        with config.patch(recompute_views=True):  # a view is free, but not to save
+        with config.patch(recompute_views=True):  # views are cheap to recompute, but not to save
             forward, backward = min_cut_rematerialization_partition(gm, joint_inputs, **fields)
         sums = _sums_of_products(backward.graph)
         layer = {_viewed(product.args[1]): root for root, products in sums.items() for product in products}
@@ -56,13 +56,13 @@ def join_saved(forward: Graph, backward: Graph, outputs: int, kinds: Mapping[Nod
         forward: its results are ``outputs`` values for the caller, then the saved ones.
         backward: its inputs begin with the saved ones, in the same order.
         outputs: number of values for the caller.
-        kinds: which inputs of the backward graph belong together, if not all.
+        kinds: groups of inputs of the backward graph; one group by default.
     """
     end, inputs = forward.output_node(), backward.find_nodes(op="placeholder")
     results = list(end.args[0])
     theirs, saved = results[:outputs], results[outputs:]
     if [node.name for node in saved] != [node.name for node in inputs[: len(saved)]]:
-        return  # sizes that vary come first in the one, last in the other
+        return  # dynamic sizes are ordered differently in the two graphs
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, node in enumerate(saved):
         if node not in theirs and node.op == "call_function" and _small(node):
@@ -84,7 +84,7 @@ def join_saved(forward: Graph, backward: Graph, outputs: int, kinds: Mapping[Nod
         backward.erase_node(inputs[index])
     kept = [node for index, node in enumerate(saved) if index not in gone]
     end.args = ((*theirs, *joined, *kept),)
-    end.meta["desc"] = end.meta["desc"][: len(end.args[0])]  # they number what is saved
+    end.meta["desc"] = end.meta["desc"][: len(end.args[0])]  # descriptions number the saved tensors
 
 
 def join_products(graph: Graph, sums: Mapping[Node, Sequence[Node]]) -> None:
@@ -92,7 +92,7 @@ def join_products(graph: Graph, sums: Mapping[Node, Sequence[Node]]) -> None:
 
     Args:
         graph: of the backward pass.
-        sums: the products of which each sum consists.
+        sums: products in each sum.
     """
     end, rows = graph.output_node(), {}
     for root, products in sums.items():
@@ -117,7 +117,7 @@ def join_products(graph: Graph, sums: Mapping[Node, Sequence[Node]]) -> None:
 
 
 def _sums_of_products(graph: Graph) -> dict[Node, list[Node]]:
-    """Results of the graph that are sums of several g' x, both small."""
+    """Returns results of the graph that are sums of several g' x, both small."""
     sums = {}
     for root in graph.output_node().all_input_nodes:
         terms = _terms(root)
@@ -134,7 +134,7 @@ def _is_weight_gradient(node: Node) -> bool:
 
 
 def _terms(node: Node) -> list[Node]:
-    """Lists the terms that a node adds up, for one user alone."""
+    """Lists the terms of a sum, through additions with a single user."""
     parts = node.args if node.target is aten.add.Tensor and not node.kwargs and len(node.users) == 1 else ()
     if parts and all(isinstance(part, Node) for part in parts):
         return [term for part in parts for term in _terms(part)]
@@ -142,26 +142,26 @@ def _terms(node: Node) -> list[Node]:
 
 
 def _viewed(node: Node) -> Node:
-    """Returns the node of which a node is a view, of the same numbers in the same order."""
+    """Returns the base node of a view or reshape."""
     while node.target in (aten.view.default, aten.reshape.default):
         node = node.args[0]
     return node
 
 
 def _in_order_of_one_input(products: Sequence[Node]) -> tuple[Node | None, list[Node]]:
-    """Returns the tensor that consists of the right factors of all ``products``, if any, and them in its order."""
+    """Returns the tensor whose split gives the right factors of ``products``, if any, and these in its order."""
     pieces = [_viewed(product.args[1]) for product in products]
     if any(piece.target is not operator.getitem for piece in pieces):
         return None, list(products)
     split = pieces[0].args[0]
-    if len(set(pieces)) < len(pieces) or set(pieces) != set(split.users):  # in it are others, too
+    if len(set(pieces)) < len(pieces) or set(pieces) != set(split.users):  # the split has other users, too
         return None, list(products)
     order = sorted(range(len(pieces)), key=lambda index: pieces[index].args[1])
     return split.args[0], [products[index] for index in order]
 
 
 def _small(node: Node) -> bool:
-    """Tells whether a node computes a small contiguous tensor."""
+    """Returns True if a node computes a small contiguous tensor."""
     value = node.meta.get("val")
     if not isinstance(value, torch.Tensor) or not value.ndim:
         return False

@@ -1,9 +1,9 @@
-"""Bundling of the loops of a compiled step into functions of C++: a short function each, used again.
+"""Splits the loops of a compiled step into short C++ functions, which are reused.
 
-Inductor puts all loops between two calls of the library into one function. Where small products are written out, that
-is a whole chunk of steps: tens of thousands of lines, with memory of its own for each number on the way. With one
-function for each loop nest, the same function serves every step of the chunk, and the memory of one step serves the
-next. Short functions compile sooner. And in steps this small, allocating memory takes as long as computing.
+Inductor puts all loops between two library calls into one function. With written-out small products, that is a whole
+chunk of steps: tens of thousands of lines, with separate memory for each intermediate value. With one function for each
+loop nest, the same function serves every step of the chunk, and steps reuse memory. Short functions compile faster, and
+in steps this small, allocating memory takes as long as computing.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ __all__ = ["ShortFunctions"]
 class ShortFunctions(CustomSchedulerPass):
     """Applied to the loop nests of each graph, after inductor has fused them.
 
-    Loops that several threads share stay in one function: they share the threads' start, too.
+    Loops with several threads stay in one function, to start the threads only once.
     """
 
     def __call__(self, nodes: Sequence[BaseSchedulerNode]) -> Sequence[BaseSchedulerNode]:
-        """Returns ``nodes``; changes how the scheduler of this graph goes through them."""
+        """Returns ``nodes``, and lets the scheduler of this graph end a function after each."""
         if not any(map(_by_several_threads, nodes)):
             devices = {node.get_device() for node in nodes}
             for device in devices:
@@ -44,7 +44,7 @@ def _always() -> bool:
 
 
 def _by_several_threads(node: BaseSchedulerNode) -> bool:
-    """Tells whether inductor shares the loops of a node among threads; by its rule, iterations for each thread."""
+    """Returns True if inductor distributes the loops of a node over threads, by its rule of iterations per thread."""
     threads = config.cpp.threads if config.cpp.threads > 0 else torch.get_num_threads()
     loops = [part for part in node.get_nodes() if isinstance(part, SchedulerNode)]
     sizes = [prod(int(size) for sizes in part.get_ranges() for size in sizes) for part in loops]

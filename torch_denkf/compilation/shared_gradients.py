@@ -1,8 +1,8 @@
-"""Gradients of linear layers that all steps of a sequence share: one product at the end in the place of one a step.
+"""Accumulates gradients of linear layers over the steps of a sequence: one product at the end instead of one per step.
 
 In each step of a backward pass a layer would launch a product for its weight, a sum over rows for its bias, and an
-addition of each to what later steps gave. On a GPU these launches are a third of a training step. Here a step keeps
-what is to be multiplied, and the layer multiplies what all steps kept.
+addition of each to the accumulated gradients. On a GPU these launches are a third of a training step. Here each step
+stores its factors, and the layer multiplies those of all steps at once.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch_denkf.modules.stochastic import LAYERS
 
 __all__ = ["shared", "sharing"]
 
-#: Elements that a layer keeps of its gradients before it multiplies them: 128 MiB in single precision.
+#: Stored gradient elements after which a layer multiplies them: 128 MiB in single precision.
 LARGEST_KEPT = 2**25
 
 
@@ -31,7 +31,7 @@ _STATE = _State()
 
 @contextmanager
 def sharing() -> Iterator[None]:
-    """Lets the steps that are taken inside share the gradients of their layers."""
+    """Enables accumulation of layer gradients for the steps inside."""
     if shared not in LAYERS:
         LAYERS.append(shared)
     before, _STATE.layers = _STATE.layers, {}
@@ -42,7 +42,7 @@ def sharing() -> Iterator[None]:
 
 
 def shared(layer: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """Returns a linear layer whose gradient the steps share; any other layer as it is."""
+    """Returns a linear layer with accumulated gradients; returns other layers unchanged."""
     if not isinstance(layer, nn.Linear) or type(layer) is not nn.Linear or _STATE.layers is None:
         return layer
     if not torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
@@ -59,7 +59,7 @@ def shared(layer: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
 
 
 class _Kept:
-    """Inputs of a layer and gradients of its outputs, and the sum of the products of those before."""
+    """Stored inputs and output gradients of a layer, and the sum of earlier products."""
 
     def __init__(self):
         self.pairs: list[tuple[Tensor, Tensor]] = []
@@ -72,7 +72,7 @@ class _Kept:
             self.total = self.taken()
 
     def taken(self) -> tuple[Tensor, Tensor] | None:
-        """Returns the gradients of weight and bias, and forgets them."""
+        """Returns the gradients of weight and bias, and resets them."""
         total, pairs = self.total, self.pairs
         self.pairs, self.count, self.total = [], 0, None
         if not pairs:
@@ -83,7 +83,7 @@ class _Kept:
 
 
 class _Gather(torch.autograd.Function):
-    """Its backward pass runs after those of all products that were given what it returns."""
+    """A node whose backward pass runs after those of all products of its output."""
 
     @staticmethod
     def forward(ctx, weight: Tensor, bias: Tensor, kept: _Kept) -> Tensor:

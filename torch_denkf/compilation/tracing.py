@@ -1,4 +1,4 @@
-"""A module as a graph of plain arithmetic, for torch.export's packages."""
+"""Traces a module to a graph without autograd, for torch.export's packages."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ __all__ = ["trace_below_autograd"]
 
 
 def trace_below_autograd(module: nn.Module, values: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
-    """Records what a module does once automatic differentiation is done.
+    """Records a module's operations after automatic differentiation.
 
-    ``torch.export.export`` records above it. There a Jacobian that is taken inside the module becomes a constant, the
-    example's, and inductor compiles an LSTM cell to other numbers (torch 2.13): packages that run, and are wrong.
+    ``torch.export.export`` records above it. There a Jacobian inside the module becomes the constant of the example,
+    and inductor compiles an LSTM cell wrongly (torch 2.13), without an error.
 
     Args:
-        module: from tensors to a tuple of tensors.
-        values: examples of its inputs; their shapes are the graph's.
+        module: maps tensors to a tuple of tensors.
+        values: examples of its inputs, which fix the shapes.
 
     Raises:
-        RuntimeError: if this torch cannot trace so.
+        RuntimeError: if this torch cannot trace in this way.
     """
     try:
         from torch.export._trace import _export

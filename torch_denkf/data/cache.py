@@ -1,4 +1,4 @@
-"""TensorDicts that were costly to make, kept on disk from one run to the next, and memory-mapped from there."""
+"""Disk cache of TensorDicts that are costly to compute; they are memory-mapped when opened."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def usual_folder() -> Path:
 
 
 def cache_folder(cache: str | Path | bool | None) -> Path | None:
-    """Returns the folder that an option ``cache`` asks for: True for the usual one, None or False for none."""
+    """Returns the folder of an option ``cache``: True for the default folder, None or False for none."""
     if cache is None or cache is False:
         return None
     if cache is not True and not isinstance(cache, (str, Path)):
@@ -35,16 +35,16 @@ def cache_folder(cache: str | Path | bool | None) -> Path | None:
 
 
 def stamp(file: Path) -> tuple[int, int]:
-    """Returns time in ns and size in bytes of a file, by which a cache knows it again; (-1, -1) without a file."""
+    """Returns the time of writing in ns and the size in bytes, which identify a file; (-1, -1) without a file."""
     try:
         status = file.stat()
-    except FileNotFoundError:  # its reader says what is missing
+    except FileNotFoundError:  # the reader of the file raises
         return (-1, -1)
     return (status.st_mtime_ns, status.st_size)
 
 
 def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
-    """Opens a cache entry; where there is none, or a damaged one, reads its content again and stores it.
+    """Opens a cache entry; if it is missing or damaged, reads its content again and stores it.
 
     Args:
         entry: folder of the entry.
@@ -60,18 +60,18 @@ def cached(entry: Path, read: Callable[[], TensorDict]) -> TensorDict:
     content = read()
     with _writing(entry) as folder:
         write_entry(folder, content)
-    return content if (stored := _load(entry)) is None else stored  # it may be gone again
+    return content if (stored := _load(entry)) is None else stored  # another process may have deleted it
 
 
 def entries_of(folder: Path) -> list[Path]:
-    """Returns the entries in a folder, sound or not, by name; what is not the cache's is left out."""
+    """Returns the cache entries in a folder, valid or damaged, sorted by name; skips other folders."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.is_dir() and is_entry(path))
 
 
 def forget(entry: Path) -> None:
-    """Removes an entry. Who has it open keeps it."""
+    """Removes an entry. Processes that have it open can still read it."""
     with _errors_of(entry), place_beside(entry) as aside, contextlib.suppress(FileNotFoundError):
         entry.rename(aside)
 
@@ -89,11 +89,11 @@ def _load(entry: Path) -> TensorDict | None:
 
 
 def _set_aside(entry: Path) -> None:
-    """Removes a damaged entry, but not the sound one that another process may have put in its place meanwhile."""
+    """Removes a damaged entry, unless another process has replaced it by a valid one."""
     with _errors_of(entry), place_beside(entry) as aside, contextlib.suppress(DamagedEntry, FileNotFoundError):
         entry.rename(aside)
         open_entry(aside)
-        with contextlib.suppress(OSError):  # there is one again
+        with contextlib.suppress(OSError):  # another process has written the entry again
             aside.rename(entry)
 
 
@@ -106,7 +106,7 @@ def _check_writable(entry: Path) -> None:
 
 @contextmanager
 def _writing(entry: Path) -> Iterator[Path]:
-    """Yields a folder next to an entry, which is renamed when it is complete: an entry that exists is complete."""
+    """Yields a temporary folder and renames it to the entry when it is complete: an entry that exists is complete."""
     with _errors_of(entry), place_beside(entry) as beside:
         yield beside
         try:

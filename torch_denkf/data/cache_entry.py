@@ -1,11 +1,11 @@
-"""One entry of the cache: tensors as files, and a manifest that says what they are and what they must sum up to.
+"""One entry of the cache: tensors as files, and a manifest with their dtypes, shapes and checksums.
 
 ::
 
     ENTRY/manifest.json      format, batch sizes, and of each tensor: dtype, shape, bytes, checksums, time of writing
     ENTRY/NAME.bin           a tensor's bytes in C order, little endian; NAME is its key, nested ones joined by dots
 
-Nothing else is read, and nothing that is read can hold code.
+No other file is read, and no file can contain code.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ __all__ = [
 MANIFEST = "manifest.json"
 FORMAT = "torch_denkf.cache/1"
 END = 1 << 16  # bytes at either end of a file that are compared when it is opened
-_BLOCK = 1 << 24  # bytes that are written or summed at a time
+_BLOCK = 1 << 24  # bytes that are written or added to a checksum at a time
 _LARGEST_MANIFEST = 1 << 20
 _DTYPES = {
     str(dtype).removeprefix("torch."): dtype
     for dtype in (torch.bool, torch.uint8, torch.int32, torch.int64, torch.float16, torch.float32, torch.float64)
 }
-#: Files that this process has compared as a whole, and when they had been written to.
+#: Files whose whole checksum this process has compared, with their time of writing.
 _COMPARED: dict[str, int] = {}
 _MAP = mmap.MAP_PRIVATE | getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
 
@@ -57,10 +57,10 @@ class DamagedEntry(Exception):
 
 
 class CachedTensor(Tensor):
-    """A file of the cache as a tensor: a process that writes to it changes a copy of its own, never the file.
+    """A file of the cache as a tensor: writing to it changes a copy in this process, never the file.
 
-    Workers get the name of the file, not its content. So they do for a view of it, such as a slice; what is computed
-    from it is a plain tensor.
+    Pickles contain the name of the file, not its content, also those of a view, such as a slice. Results of
+    computations are plain tensors.
     """
 
     file: Path
@@ -70,7 +70,7 @@ class CachedTensor(Tensor):
         """Maps a file that holds a tensor; ``view`` is the shape, the strides and the offset of a part of it.
 
         Raises:
-            OSError: if the file has another size; it does not grow.
+            OSError: if the size of the file differs from the tensor's.
         """
         whole = _map(file, dtype, torch.Size(shape))
         out = (whole.as_strided(*view) if view else whole).as_subclass(cls)
@@ -86,7 +86,7 @@ class CachedTensor(Tensor):
         return out
 
     def __reduce_ex__(self, protocol):
-        if self._version:  # it was written to: no longer what the file holds
+        if self._version:  # it was written to, and differs from the file
             return self.clone().__reduce_ex__(protocol)
         whole = (self.untyped_storage().nbytes() // self.itemsize,)
         return self.open, (self.file, self.dtype, whole, self.shape, self.stride(), self.storage_offset())
@@ -112,7 +112,7 @@ def write_entry(folder: Path, content: TensorDict) -> None:
 
 
 def seal_entry(folder: Path, content: TensorDict) -> None:
-    """Sums up the files of an entry, writes its manifest, and waits until all is on the disk."""
+    """Computes the checksums of an entry's files, writes its manifest, and waits until all is on the disk."""
     tensors = {}
     for name, tensor in _tensors(content):
         file = folder / f"{'.'.join(name)}.bin"
@@ -131,10 +131,10 @@ def _write_manifest(folder: Path, content: dict[str, Any]) -> None:
 
 
 def open_entry(folder: Path) -> TensorDict:
-    """Maps the tensors of an entry, after a look at each file's size, time of writing, and both ends.
+    """Maps the tensors of an entry, after a check of each file's size, time of writing, and both ends.
 
-    A file that was written to since the entry was sealed is compared as a whole with its checksum, once: where it is
-    sound, as after a copy, the manifest gets the new time.
+    A file with a later time of writing than in the manifest is compared once with its whole checksum; if it is valid,
+    as after a copy, the manifest gets the new time.
 
     Raises:
         DamagedEntry: if something is wrong; says what.
@@ -155,7 +155,7 @@ def open_entry(folder: Path) -> TensorDict:
     except (KeyError, TypeError, ValueError, RuntimeError, OSError) as error:
         raise DamagedEntry(f"{folder / MANIFEST} does not fit its files ({error})") from error
     if renewed:
-        with contextlib.suppress(OSError):  # a cache that may only be read is compared again by the next process
+        with contextlib.suppress(OSError):  # in a read-only cache the next process compares again
             _write_manifest(folder, content)
     return out.lock_()
 
@@ -210,7 +210,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _check(file: Path, about: dict[str, Any], whole: bool) -> int:
-    """Compares a file with what the manifest says; when it was written to last, ns."""
+    """Compares a file with its entry in the manifest, and returns its time of writing, ns."""
     try:
         with _open(file) as stream:
             size = os.fstat(stream.fileno()).st_size

@@ -1,4 +1,4 @@
-"""Degrees on the ellipsoid WGS-84 as metres of a plane that touches it, and back."""
+"""Conversion between degrees on the WGS-84 ellipsoid and metres in a local tangent plane (east, north, up)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def to_local(places: np.ndarray, origin: Sequence[float]) -> np.ndarray:
     """Converts latitude, longitude and height to metres east, north and up of an origin.
 
     Args:
-        places: latitude and longitude in degrees, and height above the ellipsoid in m or none of it, ``[*, 2 or 3]``.
-        origin: of the local axes, in the same form.
+        places: latitude and longitude in degrees, and optionally the height above the ellipsoid in m, ``[*, 2 or 3]``.
+        origin: origin of the local axes, in the same form.
 
     Returns:
-        Metres in float64, of the shape of ``places``.
+        Metres in float64, in the shape of ``places``.
 
     Examples:
         >>> to_local(np.array([51.05, 13.80]), [51.04, 13.79]).round(2)
@@ -34,11 +34,11 @@ def to_degrees(metres: np.ndarray, origin: Sequence[float]) -> np.ndarray:
     """Converts metres east, north and up of an origin to latitude, longitude and height.
 
     Args:
-        metres: east and north, and up or none of it, ``[*, 2 or 3]``; without it they lie on the origin's height.
-        origin: of the local axes, latitude and longitude in degrees and height in m or none of it.
+        metres: east and north, and optionally up, ``[*, 2 or 3]``; without up, the points have the origin's height.
+        origin: latitude and longitude in degrees of the local axes' origin, and optionally its height in m.
 
     Returns:
-        Degrees and m in float64, of the shape of ``metres``.
+        Degrees and m in float64, in the shape of ``metres``.
 
     Examples:
         >>> to_degrees(to_local(np.array([51.05, 13.80]), [51.04, 13.79]), [51.04, 13.79]).round(7)
@@ -46,14 +46,14 @@ def to_degrees(metres: np.ndarray, origin: Sequence[float]) -> np.ndarray:
     """
     count, metres, start = np.shape(metres)[-1], _whole(metres), _whole(origin)
     out = _geodetic(_centred(start) + metres @ _axes(start).T)
-    for _ in range(3 if count == 2 else 0):  # the plane leaves the origin's height
+    for _ in range(3 if count == 2 else 0):  # the tangent plane rises above the origin's height
         metres[..., 2] += start[2] - out[..., 2]
         out = _geodetic(_centred(start) + metres @ _axes(start).T)
     return out[..., :count]
 
 
 def _whole(values: np.ndarray | Sequence[float]) -> np.ndarray:
-    """A copy with a third number, zero where there is none, ``[*, 3]``."""
+    """Returns a copy with a third component, zero if it is missing, ``[*, 3]``."""
     values = np.asarray(values, float)
     if values.shape[-1:] not in ((2,), (3,)):
         raise ValueError(
@@ -63,7 +63,7 @@ def _whole(values: np.ndarray | Sequence[float]) -> np.ndarray:
 
 
 def _centred(places: np.ndarray) -> np.ndarray:
-    """Metres from the centre of the earth, ``[*, 3]``."""
+    """Converts degrees and height to metres from the centre of the earth, ``[*, 3]``."""
     (latitude, longitude), height = np.radians(places[..., :2]).T, places[..., 2].T
     normal = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
     across = (normal + height) * np.cos(latitude)
@@ -72,7 +72,7 @@ def _centred(places: np.ndarray) -> np.ndarray:
 
 
 def _geodetic(centred: np.ndarray) -> np.ndarray:
-    """Latitude, longitude and height of points given from the centre of the earth."""
+    """Converts metres from the centre of the earth to latitude, longitude and height."""
     x, y, z = centred.T
     across = np.hypot(x, y)
     latitude = np.arctan2(z, across * (1 - _E2))
@@ -85,7 +85,7 @@ def _geodetic(centred: np.ndarray) -> np.ndarray:
 
 
 def _axes(origin: np.ndarray) -> np.ndarray:
-    """East, north and up of a place, as the columns of a matrix."""
+    """Returns the directions east, north and up at a place, as the columns of a matrix."""
     latitude, longitude = np.radians(origin[:2])
     (s, c), (t, k) = (np.sin(latitude), np.cos(latitude)), (np.sin(longitude), np.cos(longitude))
     return np.array([[-t, -s * k, c * k], [k, -s * t, c * t], [0.0, c, s]])

@@ -1,4 +1,4 @@
-"""Episodes of a data set: what they are called, where they lie, and what each is for."""
+"""Episodes of a data set: names, rows, and splits."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ __all__ = [
     "select_episodes",
 ]
 
-ROW = "_row"  # entry of what is stored: where the row is in the whole data set, for its picture
+ROW = "_row"  # entry of stored rows: index of the row in the whole data set, which selects its image
 Split = Literal["train", "validation", "test", "all"]
 
 
 @dataclass(frozen=True)
 class Episode:
-    """Rows of a data set that follow each other in time.
+    """Consecutive rows of a data set.
 
     Attributes:
-        name: of the episode, unique in the data set.
+        name: name of the episode, unique in the data set.
         start: its first row in the data set.
-        length: its rows.
+        length: number of its rows.
     """
 
     name: str
@@ -44,16 +44,18 @@ class Episode:
 
     @property
     def split_name(self) -> str:
-        """Returns the name that splits hash: episodes that share it are on the same side."""
+        """Returns the name that is hashed for splits: episodes that share it are in the same split."""
         return self.name
 
 
 def hashed_share(name: str, purpose: str) -> float:
-    """Returns a number in [0, 1) made of a name: those below a share are in it, and stay in it as the share grows.
+    """Returns a hash of a name in [0, 1), for splits: a split takes the names whose hash is below its share.
+
+    A name that is in a split stays there when the share grows.
 
     Args:
-        name: of an episode.
-        purpose: of the number: two purposes give independent numbers.
+        name: name of an episode.
+        purpose: salt of the hash: two purposes give independent hashes.
 
     Examples:
         >>> share = [hashed_share(str(k), "test") < 0.2 for k in range(1000)]
@@ -78,12 +80,12 @@ def hashed_tests(share: float) -> Callable[[Episode], bool]:
 def roles_of(
     episodes: Sequence[Any], for_tests: Callable[[Any], bool], validation_share: float
 ) -> list[Literal["train", "validation", "test"]]:
-    """Assigns each episode to a split, independently of all others, so that those added later move none.
+    """Assigns each episode to a split, independently of all others, so that later episodes change no assignment.
 
     Args:
-        episodes: of the whole data set.
-        for_tests: whether an episode is for tests.
-        validation_share: of the others, this share is for validation, by :func:`hashed_share`.
+        episodes: all episodes of the data set.
+        for_tests: predicate that selects test episodes.
+        validation_share: share of the other episodes for validation, by :func:`hashed_share`.
     """
     held = [hashed_share(episode.split_name, "validation") < validation_share for episode in episodes]
     return [
@@ -93,11 +95,11 @@ def roles_of(
 
 
 def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
-    """Flags of rows: ``is_init`` where ``first``, truncated and done where ``last``, never terminated; no done at root.
+    """Returns torchrl's flags: ``is_init`` where ``first``, next truncated and done where ``last``, never terminated.
 
     Args:
         first: bool ``[n, 1]``: the row begins an episode.
-        last: bool ``[n, 1]``: it ends one.
+        last: bool ``[n, 1]``: the row ends an episode.
 
     Examples:
         >>> row = torch.arange(3).unsqueeze(-1)
@@ -111,11 +113,11 @@ def episode_flags(first: Tensor, last: Tensor) -> dict[str, Any]:
 
 
 def check_rows(rows: TensorDictBase, episodes: Sequence[Episode]) -> None:
-    """Raises for rows that are no data set's.
+    """Checks that rows have their entries, and that the episodes cover them.
 
     Raises:
-        KeyError: if they lack ``step`` or ``time``.
-        ValueError: if the episodes are not those of the rows.
+        KeyError: if ``step`` or ``time`` is missing.
+        ValueError: if the episodes are not consecutive, or have another number of rows.
     """
     missing = sorted({"step", "time"} - set(rows.keys()))
     if missing:
@@ -123,26 +125,26 @@ def check_rows(rows: TensorDictBase, episodes: Sequence[Episode]) -> None:
     end = 0
     for episode in episodes:
         if episode.start != end or episode.length < 1:
-            raise ValueError(f"episodes lie one behind the other, each of at least a row; {episode} comes at row {end}")
+            raise ValueError(f"episodes are consecutive, each of at least one row; {episode} comes at row {end}")
         end += episode.length
     if end != len(rows):
         raise ValueError(f"the episodes have {end} rows, but there are {len(rows)}")
 
 
 def rows_of(episodes: Sequence[Episode]) -> Tensor:
-    """Numbers of all rows of some episodes, ``[n]``."""
+    """Returns the indices of all rows of some episodes, ``[n]``."""
     return torch.cat([torch.arange(episode.start, episode.start + episode.length) for episode in episodes])
 
 
 def select_episodes(
     rows: TensorDictBase, chosen: Sequence[Episode], single: Tensor | None
 ) -> tuple[TensorDict, tuple[Episode, ...]]:
-    """Returns rows of the chosen episodes with their flags and numbers, and these episodes with their new places.
+    """Returns rows of the chosen episodes with flags and episode numbers, and these episodes with their new starts.
 
     Args:
-        rows: of the whole data set, ``[N]``.
+        rows: rows of the whole data set, ``[N]``.
         chosen: some of its episodes.
-        single: bool ``[N]``: take only these rows, each on its own.
+        single: bool ``[N]``: selects rows, each of which becomes an episode of one row.
     """
     index = rows_of(chosen)
     number = torch.arange(len(chosen)).repeat_interleave(torch.tensor([episode.length for episode in chosen]))

@@ -1,4 +1,4 @@
-"""The options that all data sets share."""
+"""Options of all data sets."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class ReplayOptions(TypedDict, total=False):
 
 
 def check_options(options: Mapping[str, Any]) -> None:
-    """Raises for options that are wrong whatever the data are: reading these may take long.
+    """Checks options before any data are read, which may take long.
 
     Raises:
-        TypeError: for an option that there is not.
-        ValueError: for a split that there is not, a share out of range, and options that contradict each other.
+        TypeError: for an unknown option.
+        ValueError: for an unknown split, a share out of range, and options that contradict each other.
     """
     unknown = sorted(set(options) - set(ReplayOptions.__annotations__))
     if unknown:

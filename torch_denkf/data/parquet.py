@@ -11,7 +11,7 @@ from torch_denkf.data.video import EXTRA
 __all__ = ["parquet_names", "read_parquet"]
 
 MOST_ROWS = 10**8
-MOST_BYTES, MOST_RATIO = 1 << 30, 64  # more than so many bytes may not be more than so many times the file
+MOST_BYTES, MOST_RATIO = 1 << 30, 64  # a larger table is at most so many times the file's size
 
 
 def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
@@ -20,7 +20,7 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
     Raises:
         ImportError: without pyarrow.
         FileNotFoundError: without the file.
-        ValueError: if it is damaged, lacks a column, or announces far more than a file of its size holds.
+        ValueError: if it is damaged, lacks a column, or announces far more data than its size allows.
     """
     try:
         import pyarrow as arrow
@@ -42,7 +42,7 @@ def read_parquet(file: Path, columns: Sequence[str] | None = None) -> Any:
 
 
 def parquet_names(file: Path) -> list[str]:
-    """Names of the columns of a parquet file; raises as :func:`read_parquet`."""
+    """Returns the names of a parquet file's columns; raises as :func:`read_parquet`."""
     read_parquet(file, [])
     import pyarrow.parquet as parquet
 

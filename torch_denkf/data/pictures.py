@@ -1,4 +1,4 @@
-"""Pictures of one size: scaled when they are read, kept as bytes, handed out as numbers in [0, 1]."""
+"""Images of one size: scaled when they are read, stored as uint8, returned as float32 in [0, 1]."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 
-MOST_PIXELS = 10**8  # of one picture
+MOST_PIXELS = 10**8  # of one image
 CURE = "pass cache=FOLDER, or cache=None for memory"
 
 
@@ -37,7 +37,7 @@ def check_size(size: Sequence[int]) -> tuple[int, int]:
     """Returns (height, width) as whole numbers.
 
     Raises:
-        ValueError: if they are not two, or one is not positive.
+        ValueError: unless they are two positive whole numbers.
     """
     whole = isinstance(size, Sequence) and all(hasattr(side, "__index__") for side in size)
     sides = [int(side) for side in size] if whole else []
@@ -52,7 +52,7 @@ def text_of_size(size: Sequence[int]) -> str:
 
 
 def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Scales ``[H, W, 3]`` or grey ``[H, W]`` to ``[C, *size]``: averaged over areas where it shrinks."""
+    """Scales ``[H, W, 3]`` or grey ``[H, W]`` to ``[C, *size]``; shrinking averages over areas."""
     if image.shape[:2] != size:
         shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
         image = np.ascontiguousarray(image)
@@ -63,7 +63,7 @@ def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | None:
     """Decodes a PNG, a JPEG or another file that OpenCV knows to RGB ``[H, W, 3]``; returns None if it is damaged.
 
-    By OpenCV's ``flags`` it may be grey, ``[H, W]``.
+    OpenCV's ``flags`` may select grey, ``[H, W]``.
     """
     # OpenCV would fill the rest of a truncated image, or complain on stderr: look for its end first.
     ends = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
@@ -73,10 +73,10 @@ def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | N
 
 
 def picture_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Returns images in a folder, in no order, without hidden ones, such as ._1.png, which are a file manager's.
+    """Returns the image files in a folder, unsorted, without hidden files of file managers, such as ._1.png.
 
     Raises:
-        ValueError: if two of them are of one name, so that a frame would count twice, or one is neither file nor
+        ValueError: if two files have the same stem, so that a frame would count twice, or one is neither file nor
             folder, such as a pipe, which would wait for a writer.
     """
     files: dict[str, Path] = {}
@@ -94,7 +94,7 @@ def picture_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
 
 
 def is_bomb(data: bytes) -> bool:
-    r"""Returns True if a PNG's or a JPEG's header announces more than 10^8 pixels, which would be unpacked at once.
+    r"""Returns True if a PNG's or a JPEG's header announces more than 10^8 pixels.
 
     Examples:
         >>> is_bomb(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (30000).to_bytes(4) + (30000).to_bytes(4))
@@ -113,7 +113,7 @@ def is_bomb(data: bytes) -> bool:
 
 
 def image_store(rows: int, size: tuple[int, int], folder: Path | None) -> np.ndarray:
-    """Returns zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a file in ``folder`` that goes when they are let go.
+    """Returns zeros, uint8 ``[rows, 3, H, W]``: in memory, or in a temporary file in ``folder``.
 
     Raises:
         OSError: if the folder cannot be written to, or has not enough space.
@@ -139,7 +139,7 @@ def unnamed_file(folder: Path) -> IO[bytes]:
 
 
 class JoinedPictures:
-    """Pictures of several memory-mapped stores one behind the other, none of them copied.
+    """Concatenates images of several memory-mapped stores without copying them.
 
     Args:
         stores: uint8 ``[N_k, C, H, W]`` each.
@@ -156,16 +156,16 @@ class JoinedPictures:
         self._ends = lengths.cumsum(0)
 
     def __deepcopy__(self, memo: dict) -> JoinedPictures:
-        # Nothing writes pictures, and torch cannot copy memory-mapped ones.
+        # The images are read-only, and torch cannot copy memory-mapped ones.
         return self
 
     @property
     def shape(self) -> torch.Size:
-        """Returns the shape of all of them together."""
+        """Returns the shape of the concatenation."""
         return torch.Size([int(self._ends[-1]), *self.stores[0].shape[1:]])
 
     def __getitem__(self, index: Tensor) -> Tensor:
-        """Returns pictures by number, int64 ``[m]``."""
+        """Returns images by index, int64 ``[m]``."""
         which = torch.searchsorted(self._ends, index, right=True)
         out = self.stores[0].new_empty(len(index), *self.stores[0].shape[1:])
         for number in which.unique().tolist():
@@ -175,7 +175,7 @@ class JoinedPictures:
 
 
 def float_pictures(pictures: Tensor | JoinedPictures, index: Tensor) -> dict[str, Tensor]:
-    """Returns ``"pixels"`` of some pictures, float32 in [0, 1]; zeros where the index is negative.
+    """Returns ``"pixels"`` of some images, float32 in [0, 1]; zeros for negative indices.
 
     Args:
         pictures: uint8 ``[N, C, H, W]``.

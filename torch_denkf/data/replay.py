@@ -1,4 +1,4 @@
-"""The base of all data sets: episodes one behind the other, cut into slices, with pixels that are made when sampled."""
+"""Base class of all data sets: concatenated episodes, sampled as slices, with pixels added when sampled."""
 
 from __future__ import annotations
 
@@ -28,73 +28,71 @@ Pictures = Callable[[Tensor], Mapping[str, Tensor]]
 
 
 class EpisodeReplay(BaseDatasetExperienceReplay):
-    """A read-only replay buffer of episodes: the base of all data sets, which share keys, splits and options.
+    """Read-only replay buffer of episodes: base class of all data sets, with their common keys, splits and options.
 
     ===================== ============ ===========================================================================
     key                   shape        content
     ===================== ============ ===========================================================================
     ``episode``           [n]          int64, a number in ``episodes``
     ``step``              [n,1]        int64, the row within its episode, from 0
-    ``time``              [n,1]        float64, s since the episode's begin
-    ``state``             [n,S]        float32, the truth, where it is known
-    readings              [n,...]      such as ``pixels`` [n,C,H,W] float32, ``action`` [n,A], ``flow``, ``road``; an
-                                       action is that which was sent in this row and leads to the next
-    ``observed``          [n,1]        bool: the row has a picture; what is missing is zero in ``pixels``
+    ``time``              [n,1]        float64, s since the start of the episode
+    ``state``             [n,S]        float32, the ground truth, if it is known
+    readings              [n,...]      such as ``pixels`` [n,C,H,W] float32, ``action`` [n,A], ``flow``, ``road``; the
+                                       action of a row leads to the next
+    ``observed``          [n,1]        bool: the row has an image; ``pixels`` is zero if it is missing
     ``is_init``           [n,1]        bool: the first row of an episode, or of a slice
     ``next``: ``done``,   [n,1]        bool: ``truncated`` and ``done`` in the last row of an episode, or of a slice;
     ``truncated``,                     never ``terminated``. The three at the root are False.
     ``terminated``
     ===================== ============ ===========================================================================
 
-    The next observation is the next row's. The buffer stores numbers alone; pixels become float32 when rows are
-    sampled.
+    The next observation is the next row's. Pixels are converted to float32 when rows are sampled.
 
-    **Samples.** With slices of equal length, ``sample()`` is ``[B, T]``: B slices of T rows, as filters and losses take
-    them. Single rows are ``[n]``. With ``strict_length=False``, where slices may differ in length, they come one behind
-    the other in a flat ``[n]``, and ``is_init`` marks where each begins. ``data[index]`` has the index's shape.
+    **Samples.** With slices of equal length, ``sample()`` is ``[B, T]``: B slices of T rows, the input of filters and
+    losses. Single rows are ``[n]``. With ``strict_length=False``, slices of different lengths are concatenated in a
+    flat ``[n]``, and ``is_init`` marks their beginnings. ``data[index]`` has the index's shape.
 
     A stage of :class:`~torch_denkf.training.FilterTrainer` takes ``sample=lambda generator, length: data.sample()``:
-    the trainer seeds what the sampler draws. Leave ``prefetch`` out where a training is to be resumed exactly.
+    the trainer seeds the sampler. Leave ``prefetch`` out if a training must resume exactly.
 
-    **Splits** are by episode. A hash of its number or name decides what an episode is for, so that those added later
-    move none. ``"train"`` holds all episodes that are not for tests; with a ``validation_share`` it leaves this share
-    of them out, and ``"validation"`` holds them. Pass the same share to both.
+    **Splits** are by episode. A hash of an episode's number or name assigns it to a split, so that later episodes do
+    not change the assignment. ``"train"`` has all episodes that are not for tests; a ``validation_share`` moves this
+    share of them to ``"validation"``. Pass the same share to both.
 
     :class:`~torch_denkf.envs.ReplayEnv` replays any data set as an environment.
 
     Args:
-        rows: numbers of the whole data set, ``[N]``, with ``step`` and ``time``; the rows of an episode follow each
-            other.
-        episodes: all of it, in the order of the rows.
-        for_tests: whether an episode is for tests.
-        pictures: maps numbers of ``rows``, int64 ``[m]``, to what is not stored in them, ``[m, ...]`` each.
-        single: bool ``[N]``: only these rows are offered, each on its own (``is_init`` and done in all).
-        root: the folder that was read; None for data that came from elsewhere.
+        rows: rows of the whole data set, ``[N]``, with ``step`` and ``time``; the rows of an episode are consecutive.
+        episodes: all episodes, in the order of the rows.
+        for_tests: predicate that selects the test episodes.
+        pictures: maps indices of ``rows``, int64 ``[m]``, to entries that are not stored in them, ``[m, ...]`` each.
+        single: bool ``[N]``: selects rows, each of which becomes an episode of one row.
+        root: folder of the data set; None without a folder.
         **options: as follows.
 
             * ``split``: ``"train"``, ``"validation"``, ``"test"`` or ``"all"``.
             * ``validation_share``: of the episodes that are not for tests, in [0, 1); none by default.
             * ``batch_size``: rows of a sample, over all slices.
-            * ``num_slices``: slices of a sample, each of ``batch_size / num_slices`` rows in a sequence.
-            * ``slice_len``: rows of a slice. With ``num_slices``, too, ``batch_size`` is their product.
-            * ``strict_length``: False lets episodes that are shorter than a slice come as short slices.
-            * ``sampler``: by default slices if they are asked for, else single rows at random.
+            * ``num_slices``: slices of a sample, each of ``batch_size / num_slices`` consecutive rows.
+            * ``slice_len``: rows of a slice. Together with ``num_slices``, ``batch_size`` is their product.
+            * ``strict_length``: False returns episodes that are shorter than a slice as short slices.
+            * ``sampler``: by default slices if ``num_slices`` or ``slice_len`` is given, else single rows at random.
             * ``writer``: by default one that raises.
             * ``collate_fn``: as in torchrl's buffers, like ``pin_memory`` and ``prefetch``.
             * ``pin_memory``: whether samples are pinned.
             * ``prefetch``: samples to prepare in advance, by threads.
-            * ``transform``: applied to each sample after the pixels are made, in the sample's shape. A slice's own
-              begin and end are marked after it.
+            * ``transform``: applied to each sample after the pixels are added, in the sample's shape. Begin and end of
+              each slice are marked after it.
             * ``cache``: folder of decoded pictures; True for ``$TORCH_DENKF_CACHE`` or else ``~/.cache/torch_denkf``;
               None or False for none: all pictures are then in memory. Entries may be deleted at any time.
-            * ``progress``: whether a bar shows what is decoded.
+            * ``progress``: whether to show a progress bar of the decoding.
 
     Attributes:
-        episodes: what each ``"episode"`` is: an :class:`~torch_denkf.data.Episode` with its name, first row and length.
-        sequential: False where ``single`` rows are offered, which do not follow each other.
+        episodes: :class:`~torch_denkf.data.Episode` of each number in ``"episode"``: name, first row and length.
+        sequential: False with ``single``, whose rows are not consecutive.
 
     Raises:
-        TypeError: for an option that there is not.
+        TypeError: for an unknown option.
         KeyError: for rows without ``step`` or ``time``.
         ValueError: for options out of range or that contradict each other, episodes that do not fit the rows, a split
             without episodes, and episodes that are shorter than the sampler's slices.
@@ -112,7 +110,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         (torch.Size([4, 5, 2]), torch.Size([2]))
     """
 
-    #: Readings whose statistics are numbers of the rows.
+    #: Entries of the rows to compute statistics of.
     _numbers: Sequence[str] = ("state", "action")
     _stored: Tensor | None = None  # pictures of rollouts, uint8 ``[N, C, H, W]``
 
@@ -165,16 +163,17 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
     def from_rollouts(
         cls, rollouts: Iterable[TensorDictBase], dt: float, *, test_share: float = 0.0, **options: Unpack[ReplayOptions]
     ) -> EpisodeReplay:
-        """Returns a data set of what environments showed, with statistics of all its numbers and of its pictures.
+        """Returns a data set of rollouts, with statistics of all floating vectors and of the images.
 
-        The rows are those of the root, each with the action that leads to the next one: behind
-        :class:`~torch_denkf.envs.LateActions` the one that ran. What a filter wrote in the environment is left out.
+        The rows are the root entries, each with the action that leads to the next one; after
+        :class:`~torch_denkf.envs.LateActions` that is the delayed action. Outputs of a filter in the environment are
+        left out.
 
         Args:
-            rollouts: ``[T]`` each, one episode; a batch of them ``[B, T]`` will do.
+            rollouts: ``[T]`` each, one episode; or a batch ``[B, T]``.
             dt: seconds of a step.
-            test_share: share of the episodes that are for tests, by a hash of their numbers.
-            **options: of the class.
+            test_share: share of the episodes in the test split, by a hash of their numbers.
+            **options: options of the class.
 
         Raises:
             ValueError: if an episode ends within a rollout, or ``"pixels"`` are not uint8 ``[T, C, H, W]``.
@@ -188,7 +187,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         """
         parts, episodes = [], []
         for number, rollout in enumerate(rollouts):
-            if rollout.ndim == 1:  # split_trajectories pads, and marks what it does not
+            if rollout.ndim == 1:  # split_trajectories pads, and marks the valid rows
                 rollout = rollout[rollout.get(("collector", "mask"), ...)]
             if rollout.ndim != 1 or rollout["next", "done"][:-1].any():
                 raise ValueError(
@@ -220,17 +219,17 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return data
 
     def draw(self, generator: torch.Generator, length: int | None = None) -> TensorDictBase:
-        """Draws a sample with all randomness from a generator, as a :class:`torch_denkf.training.Stage` asks for.
+        """Draws a sample with all randomness from a generator, for a :class:`torch_denkf.training.Stage`.
 
         Args:
             generator: on the CPU; with the same state it draws the same rows.
-            length: rows of a slice in this sample, as many slices as ever; by default the data set's own.
+            length: rows of a slice in this sample, with the same number of slices; by default the data set's.
 
         Returns:
             As :meth:`sample`, ``[B, T]`` for slices.
 
         Raises:
-            ValueError: if there are no slices to have a length, an episode is shorter, or samples are drawn in advance.
+            ValueError: if ``length`` is given without slices, an episode is shorter, or samples are drawn in advance.
 
         Example:
             >>> import torch
@@ -254,7 +253,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
             sampler.slice_len = None if own is None else length
             check_episode_lengths(self.episodes, sampler, rows)
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "Got conflicting batch_sizes")  # another length is what is wanted
+                warnings.filterwarnings("ignore", "Got conflicting batch_sizes")  # the other length is intended
                 return self.sample(rows)
         finally:
             sampler.slice_len = own
@@ -273,20 +272,20 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @cached_property
     def statistics(self) -> TensorDict:
-        """Returns means and standard deviations over the **training** episodes, whatever the split and rows.
+        """Returns means and standard deviations over the **training** episodes, for every split.
 
-        They standardise what a network reads and predicts, and tell it nothing about other episodes.
+        They standardise inputs and outputs of a network without information from other episodes.
 
         ========================== ============ ======================================================================
         key                        shape        of
         ========================== ============ ======================================================================
-        ``("state", "mean")``      [S]          all rows, likewise ``std``; a joint that never moves has a ``std`` of 0
-        ``("action", "mean")``     [A]          where there are actions, likewise ``std``
-        ``("pixels", "mean")``     [C,1,1]      each channel, over rows whose picture is there, likewise ``std``
+        ``("state", "mean")``      [S]          all rows; also ``std``, which is 0 for a joint that never moves
+        ``("action", "mean")``     [A]          actions, if there are any; also ``std``
+        ``("pixels", "mean")``     [C,1,1]      each channel, over observed rows; also ``std``
         ========================== ============ ======================================================================
 
-        Standard deviations divide by the number of values. Readings that come with a mask, ``NAME_observed``, count
-        where it is True. The pixels' are computed once, by a pass over all pictures.
+        Standard deviations divide by the number of values. Readings with a mask, ``NAME_observed``, count only if it is
+        True. Statistics of pixels are computed once, in a pass over all images.
 
         Raises:
             ValueError: if no episode is in the training split.
@@ -303,7 +302,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return [key for name in self._numbers for key in (name, f"{name}_observed")]
 
     def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
-        """Returns statistics of numbers of the training rows."""
+        """Returns statistics of vectors in the training rows."""
         statistics = {}
         for key in self._numbers:
             if key in rows:
@@ -312,7 +311,7 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         return statistics
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Returns statistics of the pixels of some rows of the whole data set; None without pictures."""
+        """Returns statistics of the pixels of some rows of the whole data set; None without images."""
         if self._stored is None:
             return None
         seen = self._all_rows.get("observed", None)
@@ -323,16 +322,16 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
 
     @property
     def data_path(self) -> Path | None:
-        """Returns the folder that the data set reads; None for one that came from elsewhere."""
+        """Returns the folder of the data set; None without a folder."""
         return self.root
 
     @property
     def data_path_root(self) -> Path | None:
-        """Returns the same folder: splits are no folders."""
+        """Returns the same folder, as splits have no folders."""
         return self.root
 
     def delete(self) -> None:
-        """Raises: the files of the data set are not its own.
+        """Raises ``RuntimeError``, as the data set did not write its files.
 
         Raises:
             RuntimeError: always.
@@ -340,8 +339,8 @@ class EpisodeReplay(BaseDatasetExperienceReplay):
         raise RuntimeError(f"the recordings {self._source} were not written by this data set; delete them by hand")
 
     def __getstate__(self) -> dict[str, Any]:
-        # TorchRL shares a storage's counters with processes that it spawns, which fails inside of what it pickles for
-        # workers of environments. Nothing is written here, so that each process may have a storage of its own.
+        # TorchRL shares a storage's counters with spawned processes, which fails when workers of environments are
+        # pickled. The buffer is read-only, so that each process may have a copy of the storage.
         writer = copy(self._writer)
         writer.register_storage(None)
         return {**super().__getstate__(), "_storage": self._storage.get(slice(None)), "_writer": writer}
@@ -361,7 +360,7 @@ def _then(first: Transform, fn: Callable, rows: TensorDictBase) -> TensorDictBas
 
 
 class _AddPictures(Transform):
-    """Adds to rows of the buffer what is not stored in them.
+    """Adds entries, such as pixels, that are not stored in the rows.
 
     Args:
         pictures: see :class:`EpisodeReplay`.
@@ -372,8 +371,8 @@ class _AddPictures(Transform):
         self.pictures = pictures
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Adds pictures to rows."""
-        tensordict = tensordict.copy()  # data[:] hands out the storage itself
+        """Adds images to rows."""
+        tensordict = tensordict.copy()  # data[:] returns the storage itself
         row = tensordict.pop(ROW)
         if self.pictures is not None:
             for key, value in self.pictures(row.reshape(-1)).items():

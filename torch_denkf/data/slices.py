@@ -1,4 +1,4 @@
-"""Samples of slices: which sampler cuts them, and the shape ``[B, T]`` in which they come."""
+"""Samples of slices: their sampler, and their shape ``[B, T]``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Slices", "check_episode_lengths", "choose_sampler", "slices_of"]
 
 
 def choose_sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | None]:
-    """Returns a sampler, of slices of episodes if a data set's options ask for them, and the batch size.
+    """Returns the sampler of a data set's options, of slices if they are requested, and the batch size.
 
     Raises:
         ValueError: if ``sampler`` comes with ``num_slices`` or ``slice_len``, or these two contradict ``batch_size``.
@@ -46,7 +46,7 @@ def choose_sampler(options: Mapping[str, Any]) -> tuple[Sampler | None, int | No
 
 
 def slices_of(sampler: Sampler | None) -> Slices | None:
-    """Brings samples into shape where the sampler's slices have equal lengths; None elsewhere."""
+    """Returns the unit that shapes samples as ``[B, T]``; None unless the sampler's slices have equal lengths."""
     if not isinstance(sampler, SliceSampler) or any(sampler.span):
         return None
     return Slices(sampler) if sampler.strict_length or sampler.pad_output else None
@@ -63,7 +63,7 @@ class Slices(SampleUnit):
         self._sampler = sampler
 
     def expand(self, index: Any, info: dict[str, Any], storage: Any) -> tuple[Any, dict[str, Any]]:
-        """Reshapes rows to slices, with the sampler's information about each of them."""
+        """Reshapes rows, and the sampler's information about them, to slices."""
         first = index[0] if isinstance(index, tuple) else index
         rows = len(first)
         ends = info.get(self._sampler.truncated_key)  # without replacement, the last sample may have fewer slices
@@ -71,7 +71,7 @@ class Slices(SampleUnit):
         shape = (count if ends is None else int(ends.sum()), -1)
 
         def shaped(value: Any) -> Any:
-            # Weights of prioritised samplers may be arrays; what is not a row's stays as it is.
+            # Weights of prioritised samplers may be arrays; values that are not per row are unchanged.
             if getattr(value, "ndim", 0) and len(value) == rows:
                 return torch.as_tensor(value).reshape(*shape, *value.shape[1:])
             return value
@@ -81,7 +81,7 @@ class Slices(SampleUnit):
 
 
 def check_episode_lengths(episodes: Sequence[Episode], sampler: Sampler | None, batch_size: int | None) -> None:
-    """Raises for episodes that are too short; TorchRL's samplers leave them out without a warning.
+    """Checks that no episode is too short; TorchRL's samplers would skip it without a warning.
 
     Raises:
         ValueError: if an episode is shorter than a slice.

@@ -1,4 +1,4 @@
-"""Means and standard deviations of readings and of pictures."""
+"""Means and standard deviations of readings and of images."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def picture_statistics(pictures: Tensor | JoinedPictures, index: Tensor, chunk: 
 
     Args:
         pictures: uint8 ``[N, C, H, W]``, maybe memory-mapped.
-        index: which of them count, ``[n]``.
-        chunk: pictures that are looked at together.
+        index: indices of the images, ``[n]``.
+        chunk: images that are read together.
     """
-    counts = torch.zeros(pictures.shape[1], 256, dtype=torch.float64)  # how often each value is there, which is exact
+    counts = torch.zeros(pictures.shape[1], 256, dtype=torch.float64)  # histogram of each channel, for exact statistics
     for part in index.split(chunk):
         for channel, values in enumerate(pictures[part].unbind(1)):
             counts[channel] += torch.bincount(values.reshape(-1), minlength=256)

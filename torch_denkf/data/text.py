@@ -8,10 +8,10 @@ __all__ = ["read_lines", "read_number"]
 
 
 def read_number(text: str) -> float:
-    """Returns the number that a text is; ``1_3`` is none, although Python reads 13.
+    """Converts a text to a number; ``1_3`` raises, although Python reads 13.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if it is no number.
     """
     if "_" in text:
         raise ValueError(f"could not convert string to float: {text!r}")
@@ -22,7 +22,7 @@ def read_lines(file: Path) -> list[str]:
     """Returns the lines of a text file in UTF-8.
 
     Raises:
-        ValueError: if it is no such text; the message names the file and the line.
+        ValueError: if it is not UTF-8; the message names the file and the line.
     """
     data = file.read_bytes()
     try:

@@ -1,4 +1,4 @@
-"""Times of a recording: which of them are sound, values for the others, and which reading belongs to which row."""
+"""Times of a recording: masks and interpolates invalid ones, and assigns readings to rows."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 
 Way = Literal["last", "nearest", "linear"]
 Span = Literal["common", "all"]
-STILL = 0.1  # a step that is shorter, in median steps, is none: the stamp was written twice
-FARTHEST = 1e9  # median steps from the other stamps, beyond which a stamp is none: years, at a camera's rate
-MOST_WRONG = 0.1  # a share of times that are wrong, up to which the others are trusted
+STILL = 0.1  # median steps: a stamp after a shorter step is a duplicate
+FARTHEST = 1e9  # median steps: a stamp farther from the median is invalid (years, at a camera's rate)
+MOST_WRONG = 0.1  # largest share of invalid times that are interpolated
 SLACK = 1e-6  # s: times that differ by less are the same
 MOST_ROWS = 10**8  # of one recording: eleven days at 100 Hz
 
 
 def sound(times: np.ndarray) -> np.ndarray:
-    """Masks stamps that are finite and increase, neither by next to nothing nor beyond any clock, bool ``[N]``.
+    """Masks stamps that are finite, increase, and are neither duplicates nor far outliers, bool ``[N]``.
 
     Examples:
         >>> sound(np.array([0.0, np.nan, 2.0, 2.001, 3.0, 1e9, 4.0])).tolist()
@@ -41,12 +41,12 @@ def sound(times: np.ndarray) -> np.ndarray:
 
 
 def filled(times: np.ndarray, good: np.ndarray, step: float) -> np.ndarray:
-    """Interpolates times that are not sound on straight lines between the others, and extrapolates beyond these.
+    """Interpolates invalid times linearly between the valid ones, and extrapolates beyond these.
 
     Args:
-        times: ``[N]``, of which one at least is sound.
-        good: which are, bool ``[N]``.
-        step: between two rows, where only one is.
+        times: ``[N]``, at least one of them valid.
+        good: mask of valid times, bool ``[N]``.
+        step: time between two rows, for a single valid time.
 
     Examples:
         >>> filled(np.array([9.0, 1.0, 9.0, 3.0, 9.0]), np.array([False, True, False, True, False]), 1.0).tolist()
@@ -63,16 +63,16 @@ def filled(times: np.ndarray, good: np.ndarray, step: float) -> np.ndarray:
 def increasing(times: np.ndarray) -> np.ndarray:
     """Masks the values of the longest strictly increasing sub-sequence, bool ``[N]``.
 
-    One value that is too small, or too large, is the only one left out; a rule that compares with what came before
-    would leave out all that follow a value that is too large. Where both leave out as many, it is the later ones,
-    unless that makes the whole longer.
+    A single outlier, too small or too large, is the only value left out; comparison with the running maximum would
+    leave out all values after one that is too large. If both rules leave out equally many, the running maximum is used,
+    unless its values span a longer time.
 
     Examples:
         >>> increasing(np.array([0.0, 1.0, 9.0, 2.0, 2.0, 3.0])).tolist()
         [True, True, False, True, False, True]
     """
     ends: list[float] = []  # the least end of an increasing sub-sequence, by its length
-    last: list[int] = []  # where that end is
+    last: list[int] = []  # index of that end
     before = np.full(len(times), -1)
     for index, value in enumerate(times.tolist()):
         length = bisect_left(ends, value)
@@ -94,16 +94,16 @@ def increasing(times: np.ndarray) -> np.ndarray:
 
 
 def row_times(streams: Mapping[str, np.ndarray], clock: str | float, span: Span = "common") -> np.ndarray:
-    """Returns times of the rows, in s.
+    """Returns the times of the rows, s.
 
     Args:
         streams: times of each stream's readings, s, ascending.
-        clock: the stream whose times are the rows', or a rate in Hz.
-        span: ``"common"`` for those at which every stream has begun and none has ended; ``"all"`` for all times of the
-            clock, which a rate has from the first begin to the last end of a stream.
+        clock: stream whose times become the rows' times, or a rate in Hz.
+        span: ``"common"`` for times after every stream has begun and before any has ended; ``"all"`` for all times of
+            the clock; a rate runs from the first begin to the last end of a stream.
 
     Raises:
-        ValueError: if the streams do not overlap by two rows, or by so many that the times cannot be in s.
+        ValueError: if the streams overlap by fewer than two rows, or by so many that the times cannot be in s.
 
     Examples:
         >>> streams = {"camera": np.array([0.0, 0.5, 1.0, 1.5]), "state": np.array([0.4, 1.1])}
@@ -134,7 +134,7 @@ def _between(begin: float, end: float, streams: Mapping[str, np.ndarray], clock:
         return times[(times >= begin - SLACK) & (times <= end + SLACK)]
     if (end - begin) * clock > MOST_ROWS:
         raise ValueError(
-            f"{clock:g} rows a second from {begin:.15g} to {end:.15g} s are more than {MOST_ROWS:.0e}; pass a lower "
+            f"{clock:g} rows per second from {begin:.15g} to {end:.15g} s are more than {MOST_ROWS:.0e}; pass a lower "
             "clock=, or unit= for tables whose times are not in s"
         )
     return begin + np.arange(int((end - begin + SLACK) * clock) + 1) / clock
@@ -143,16 +143,16 @@ def _between(begin: float, end: float, streams: Mapping[str, np.ndarray], clock:
 def last_reading(
     times: np.ndarray, rows: np.ndarray, tolerance: float | None, taken: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns for each row the last reading that arrived by then, and whether it arrived since the row before.
+    """Returns for each row the last reading that has arrived, and whether it arrived after the row before.
 
     Args:
-        times: when the readings arrived, s, ascending, ``[m]``.
+        times: arrival times of the readings, s, ascending, ``[m]``.
         rows: times of the rows, s, ascending, ``[n]``.
-        tolerance: s; an older reading is none.
-        taken: when the readings were taken, s, ``[m]``; by default they arrive at once.
+        tolerance: s; an older reading counts as missing.
+        taken: measurement times, s, ``[m]``; by default the arrival times.
 
     Returns:
-        Its index ``[n]``, -1 where there is none, and whether it is new, bool ``[n]``.
+        Index of the reading ``[n]``, -1 if there is none, and whether it is new, bool ``[n]``.
 
     Examples:
         >>> last_reading(np.array([0.0, 1.0]), np.array([0.0, 0.5, 1.0]), None)
@@ -167,12 +167,11 @@ def last_reading(
 
 
 def rows_ago(taken: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Returns the latency of the reading in each row: the rows since the first one at, or after, it was taken.
+    """Returns the latency of the reading in each row: the rows since the first row at or after its measurement.
 
     Args:
-        taken: s, ``[n]``.
-        rows: times of the rows that show it, s, ascending, ``[n]``. Where a reading was taken before the first, the
-            rows are thought to go on there.
+        taken: measurement times, s, ``[n]``.
+        rows: times of the rows, s, ascending, ``[n]``; extrapolated for readings before the first row.
 
     Returns:
         int64 ``[n]``.
@@ -188,15 +187,15 @@ def rows_ago(taken: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """Returns for each row the nearest reading in time, also a later one, and whether the row is its nearest, too.
+    """Returns for each row the reading nearest in time, before or after, and whether the row is nearest to it.
 
     Args:
         times: see :func:`last_reading`.
-        rows: times of the rows, in s, ``[n]``, rising.
-        tolerance: s; a reading farther away is none. By default half the usual time between two rows.
+        rows: times of the rows, s, ascending, ``[n]``.
+        tolerance: s; a reading farther away counts as missing. By default half the median time between two rows.
 
     Returns:
-        As :func:`last_reading`: index and whether the reading is seen here; in no other row, then.
+        As :func:`last_reading`: index, and whether the reading is observed in this row, which is True in one row only.
 
     Examples:
         >>> nearest_reading(np.array([0.1, 1.4]), np.array([0.0, 1.0, 2.0]), None)
@@ -208,7 +207,7 @@ def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None
     index = np.where(rows - times[left] <= times[right] - rows, left, right)
     off = np.abs(times[index] - rows)
     there = off <= tolerance + SLACK
-    order = np.lexsort((off, index))  # of the rows that share a reading, the nearest comes first
+    order = np.lexsort((off, index))  # the nearest row of each reading comes first
     mine = np.zeros(len(rows), bool)
     mine[order] = np.diff(index[order], prepend=-1) != 0
     return np.where(there, index, -1), there & mine
@@ -217,16 +216,16 @@ def nearest_reading(times: np.ndarray, rows: np.ndarray, tolerance: float | None
 def interpolate(
     times: np.ndarray, values: np.ndarray, rows: np.ndarray, tolerance: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolates on a straight line between the reading before a row and the one after it.
+    """Interpolates linearly between the reading before a row and the one after it.
 
     Args:
         times: see :func:`last_reading`.
         values: of the readings, ``[m, C]``.
-        rows: times of the rows, in s, ``[n]``, rising.
+        rows: times of the rows, s, ascending, ``[n]``.
         tolerance: s; between readings that are farther apart there is no value.
 
     Returns:
-        Values ``[n, C]``, zero where there is none, and where there is one, bool ``[n]``.
+        Values ``[n, C]``, zero if missing, and the mask of rows with a value, bool ``[n]``.
 
     Examples:
         >>> interpolate(np.array([0.0, 1.0]), np.array([[0.0], [2.0]]), np.array([0.25, 1.0]), None)

@@ -1,4 +1,4 @@
-"""Frames of a video by the time at which they are shown."""
+"""Frames of a video by their presentation times."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ NOT_DECODED = (
 
 
 def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Decodes a video once and pairs its frames with the times that are asked for.
+    """Decodes a video once and assigns its frames to the given times.
 
-    By time and not by count: a damaged frame, which decoders leave out without a word, must not shift those after it.
+    Frames are assigned by time, not by count: decoders skip damaged frames silently, which would shift later ones.
 
     Args:
         file: the video.
         times: s after the video's first frame, ``[n]``, in any order.
-        tolerance: s by which a frame may be off.
+        tolerance: largest difference in time, s.
 
     Yields:
-        Indices into ``times``, and the frame for them, RGB uint8 ``[H, W, 3]``. An index comes again if a later frame
-        is nearer; one without any frame within the tolerance never comes.
+        Indices into ``times``, and their frame, RGB uint8 ``[H, W, 3]``. An index is yielded again if a later frame is
+        nearer; an index without a frame within the tolerance is not yielded.
 
     Raises:
         FileNotFoundError: without the file.
@@ -56,10 +56,10 @@ def frames_at_times(file: Path, times: np.ndarray, tolerance: float) -> Iterator
 
 
 def decoded_frames(file: Path) -> Iterator[tuple[float, np.ndarray]]:
-    """Yields all frames that can be decoded, in the order in which they are shown."""
+    """Yields all frames that can be decoded, in the order of presentation."""
     capture = cv2.VideoCapture(name_for_c(file), cv2.CAP_FFMPEG)
     try:
-        # OpenCV's wheels leave AV1, LeRobot's default, to the hardware.
+        # OpenCV's wheels decode AV1, LeRobot's default, only in hardware.
         if _codec(capture) == "av01":
             try:
                 import av
@@ -74,18 +74,18 @@ def decoded_frames(file: Path) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def say_if_cut(file: Path, times: Sequence[float]) -> None:
-    """Warns where a video ends before the end that its header announces.
+    """Warns if a video is shorter than its header announces.
 
     Args:
         file: the video.
-        times: s, of the frames that could be decoded, one at least.
+        times: times of the decoded frames, s, at least one.
     """
     capture = cv2.VideoCapture(name_for_c(file), cv2.CAP_FFMPEG)
     count, rate = (capture.get(what) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
     capture.release()
     if count <= 0 or rate <= 0:
         return
-    # The last frame is shown for a step, and where the header has no count, OpenCV rounds one.
+    # The last frame lasts one step; without a count in the header, OpenCV estimates it from the duration.
     step = max(np.diff(times).max(initial=0), 1 / rate)
     shown = times[-1] - times[0] + 1 / rate
     if count / rate > shown + 0.6 * step:
@@ -101,8 +101,8 @@ def _codec(capture: cv2.VideoCapture) -> str:
 
 
 def _by_opencv(capture: cv2.VideoCapture) -> Iterator[tuple[float, np.ndarray]]:
-    # A failed read is the end, or a damaged frame in the middle: then further reads go on behind it. The count is a
-    # guess, too low where the rate varies, so that the end is the first failure after it.
+    # A failed read is the end, or a damaged frame, after which reading continues. The announced count is too low for
+    # varying rates, so that the end is the first failure after it.
     expected, read, there = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, True
     while there or read < expected:
         there, frame = capture.read()

@@ -1,6 +1,6 @@
-"""A filter's step as a file that runs without the training code, and an analysis that several processes share.
+"""Export of a filter's step to a file that runs without the training code, and an analysis over several processes.
 
-:func:`load_step` needs torch alone. The others, which need all of torch_denkf, are imported when they are used.
+:func:`load_step` needs only torch. The others, which need all of torch_denkf, are imported when they are used.
 """
 
 from importlib import import_module

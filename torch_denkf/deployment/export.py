@@ -1,4 +1,4 @@
-"""Writing a filter's step into a file: a package of torch, by default compiled ahead of time, or an ONNX model."""
+"""Exports a filter's step to a file: a package of torch, by default compiled ahead of time, or an ONNX model."""
 
 from __future__ import annotations
 
@@ -55,32 +55,33 @@ def export_step(
     """Writes one step of a filter as a file with static shapes that runs without torch_denkf's training code.
 
     The file is a package of torch, or an `ONNX <https://onnx.ai>`_ model. onnxruntime runs such a model without torch,
-    from Python, C++, C# or Java. A package holds native code, or a graph that torch unpickles: who loads it runs it.
-    Hand it on, and take it, as you would a program. An ONNX model is data.
+    from Python, C++, C# or Java. A package has native code, or a graph that torch unpickles: loading it executes code,
+    so treat it like a program. An ONNX model is data.
 
-    A package draws everything random inside, from torch's generator, unless ``example`` holds the noise (see
-    :meth:`~torch_denkf.filters.Filter.draw_noise`): then it is an input, and the step is a function of its inputs. In
-    an ONNX model noise is always an input. Its names begin with ``noise.``. Real numbers are standard normal, but for
-    ``uniform`` of a particle filter, which lies between 0 and 1; bytes are uniform, and booleans are fair coins.
+    A package draws its noise from torch's generator, unless ``example`` has the noise (see
+    :meth:`~torch_denkf.filters.Filter.draw_noise`): then noise is an input, and the step is deterministic. In an ONNX
+    model noise is always an input. Its names begin with ``noise.``. Floating inputs are standard normal, except
+    ``uniform`` of a particle filter, which is uniform in [0, 1]; bytes are uniform, and booleans are True with
+    probability one half.
 
-    ONNX lacks factors of matrices. Small systems are written out: readings of up to 4 numbers, and covariances of up to
-    6 x 6. What remains raises an error that names its operator.
+    ONNX lacks matrix factorisations. Small ones are written out: readings of up to 4 components, and covariances of up
+    to 6 x 6. Other unsupported operators raise an error with their name.
 
-    A package cannot raise: after a reading that is not finite its belief is NaN from then on. Put a mask into
-    ``example``, and set it to ``False`` for such readings.
+    A package cannot raise: after a reading that is not finite its belief stays NaN.
 
-    What the package returns for the example is compared with the eager step, see
-    :meth:`~torch_denkf.filters.Filter.compile`; with noise in the example number by number, otherwise within what the
-    noise changes.
+    Put a mask into ``example``, and set it to ``False`` for such readings. The package's result for the example is
+    compared with the eager step, see :meth:`~torch_denkf.filters.Filter.compile`; with noise in the example
+    elementwise, otherwise up to the effect of the noise.
 
     Args:
-        filter: trained; its device is the package's.
-        example: frame entries, and whatever optional ones (mask, action, noise) the step shall read, for one step
-            ``[*B]`` with the shapes and dtypes of the real ones. Where the belief is missing, it is initialised.
+        filter: trained filter, on the device of the package.
+        example: frame entries, and the optional inputs (mask, action, noise) of the step, for one step ``[*B]`` with
+            the shapes and dtypes of the real ones. A missing belief is initialised.
         path: ends in ``.pt2``, or, for an ONNX model, in ``.onnx``.
-        out_keys: what to return besides the belief, e.g. ``("info", "nis")``.
-        compiled: compile ahead of time (AOTInductor; needs a C++ compiler here and the same kind of processor there).
-            Otherwise the graph is written, which torch runs on any machine, slower. An ONNX model is such a graph.
+        out_keys: further outputs, e.g. ``("info", "nis")``.
+        compiled: compile ahead of time (AOTInductor; needs a C++ compiler here and the same kind of processor on the
+            target). Otherwise the graph is written, which torch runs on any machine, more slowly. An ONNX model is such
+            a graph.
         format: ``"pt2"`` for a package, ``"onnx"`` for an ONNX model.
 
     Returns:
@@ -88,12 +89,12 @@ def export_step(
 
     Raises:
         KeyError: if an entry that the step reads is missing.
-        ValueError: if there is no such format, the path does not end in it, or the filter does not write one of
+        ValueError: if there is no such format, the path has another suffix, or the filter does not write one of
             ``out_keys``.
-        ImportError: for an ONNX model without onnx, onnxscript or onnxruntime; names the extra.
+        ImportError: for an ONNX model without onnx, onnxscript or onnxruntime; the message names the extra.
         RuntimeError: if there is no C++ compiler, this torch cannot trace the step, ONNX lacks one of its operators, or
-            the file is wrong.
-        OSError: if it cannot be written, as on a full disk; names the file and the free space.
+            the exported step differs from the eager one.
+        OSError: if it cannot be written, as on a full disk; the message names the file and the free space.
 
     Example:
         >>> import tempfile
@@ -136,7 +137,7 @@ def export_step(
     if format == "onnx":
         entries |= filter.draws.missing(entries, example.batch_size)
     in_keys = _inputs(filter, entries, example)
-    # Not parts of one another, whose strides the graph would hold.
+    # Contiguous clones: views would fix their strides in the graph.
     values = tuple(entries[key].clone(memory_format=torch.contiguous_format) for key in in_keys)
     inputs, outputs = [_name(key) for key in in_keys], [_name(key) for key in out_keys]
     kinds = [(list(value.shape), str(value.dtype)) for value in values]
@@ -149,7 +150,7 @@ def export_step(
     )
     was_training = filter.training
     step = _FlatStep(filter.eval(), in_keys, out_keys, example.batch_size)
-    package = io.BytesIO()  # torch's own writer ends the process where the disk is full
+    package = io.BytesIO()  # torch's writer ends the process on a full disk
     try:
         with torch.no_grad():
             program = trace_below_autograd(step, values)
@@ -199,7 +200,7 @@ def _run(package: io.BytesIO, compiled: bool) -> Callable:
 
 
 def _inputs(filter: Filter, entries: Entries, example: TensorDictBase) -> list[NestedKey]:
-    """Lists the inputs of the step: all that it must read, and what the example has of what it may."""
+    """Lists the inputs of the step: the required ones, and the optional ones in the example."""
     structure = filter.structure
     keys = [*structure.needed, *structure.controls, *structure.carry]
     missing = [key for key in keys if key not in entries]

@@ -1,4 +1,4 @@
-"""Results on disk: written whole or not at all, and a clear word where the disk is full."""
+"""Atomic writes of result files, and clear errors on a full disk."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 _WRITING, _LOCK = ".writing-", "lock"
-_UNLOCKED = 3600.0  # s without a change, after which a half written place without a lock is a dead process's
+_UNLOCKED = 3600.0  # s without a change, after which an incomplete folder without a lock belongs to a dead process
 _BLOCK = 1 << 24
 #: Errors of the disk, not of the path.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
@@ -39,16 +39,16 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 def clear_errors(
     file: Path, cure: str = "choose another folder", *, beside: Path | None = None, name: str = ""
 ) -> Iterator[None]:
-    """Errors of writing to a file or folder say its name, the free space, and what to do.
+    """Rewrites errors of writing to a file or folder: with its name, the free space, and what to do.
 
     Args:
-        file: what is written.
-        cure: what to do if not only space is missing.
-        beside: where it is written to until it is complete.
-        name: of what is written, for the message; by default the file.
+        file: the file or folder.
+        cure: what to do apart from freeing space.
+        beside: temporary path until it is complete.
+        name: name for the message; by default the file.
 
     Raises:
-        OSError: of the same kind and number, with the message.
+        OSError: the same kind and number, with the message.
     """
     try:
         yield
@@ -65,10 +65,10 @@ def clear_errors(
 
 
 def name_for_c(file: str | Path) -> str:
-    """Returns a path for a library in C that reads it as UTF-8, such as OpenCV, which any other name ends by a crash.
+    """Returns a path for a C library that needs UTF-8, such as OpenCV, which crashes on other names.
 
     Raises:
-        ValueError: if it is no UTF-8; the message has its bytes.
+        ValueError: if it is no UTF-8; the message shows its bytes.
 
     Examples:
         >>> name_for_c(Path("run1.mp4"))
@@ -89,17 +89,17 @@ def _holds(folder: str, file: Path) -> bool:
 def replacing(file: str | Path) -> Iterator[Path]:
     """Yields a path whose file replaces ``file`` when the block ends, synced with the disk.
 
-    Where the block or the disk fails, an earlier ``file`` stays as it was, and nothing else is left. What a killed
-    process left in the folder goes when the next file is written there.
+    If the block or the disk fails, an existing ``file`` is unchanged, and no other file is left. Temporary files of
+    killed processes are removed with the next write to the folder.
 
     Args:
-        file: result; its folder is made. What is no plain file, such as ``/dev/stdout``, is written to directly.
+        file: result; its folder is created. A device, such as ``/dev/stdout``, is written to directly.
 
     Yields:
         The path of an empty file of the same name, in a folder next to it.
 
     Raises:
-        OSError: if the file cannot be written; names it and the free space.
+        OSError: if the file cannot be written; the message names it and the free space.
 
     Example:
         >>> import tempfile
@@ -113,7 +113,7 @@ def replacing(file: str | Path) -> Iterator[Path]:
         >>> file.read_text(), len(list(file.parent.iterdir()))
         ('earlier', 1)
     """
-    file = Path(os.path.realpath(Path(file).expanduser()))  # a link stays one
+    file = Path(os.path.realpath(Path(file).expanduser()))  # keeps symbolic links
     if file.exists() and not file.is_file() and not file.is_dir():
         with clear_errors(file):
             yield file
@@ -125,26 +125,26 @@ def replacing(file: str | Path) -> Iterator[Path]:
     with clear_errors(file, beside=file.parent / _WRITING), place_beside(file) as beside:
         beside.touch()
         yield beside
-        sync(beside)  # else a power failure could put an empty file in the place of a good one
+        sync(beside)  # else a power failure could replace a good file by an empty one
         os.replace(beside, file)
         sync(file.parent)
 
 
 def write_bytes(file: str | Path, data: bytes | bytearray | memoryview) -> None:
-    """Writes a file whole or not at all; see :func:`replacing`."""
+    """Writes a file atomically; see :func:`replacing`."""
     with replacing(file) as beside, beside.open("wb") as stream:
         stream.write(data)
 
 
 def write_text(file: str | Path, text: str) -> None:
-    """Writes a text in UTF-8 whole or not at all; see :func:`replacing`."""
+    """Writes a text in UTF-8 atomically; see :func:`replacing`."""
     write_bytes(file, text.encode())
 
 
 def reserve(stream: IO[bytes], size: int) -> None:
-    """Gives a new file its size, with the space for it on the disk: what is then written through a map has its place.
+    """Allocates a new file's space on the disk, for writing through a memory map.
 
-    Without that, a disk that is full ends the process (SIGBUS).
+    Otherwise a full disk ends the process (SIGBUS).
 
     Raises:
         OSError: if there is not enough space.
@@ -164,7 +164,7 @@ def reserve(stream: IO[bytes], size: int) -> None:
 
 
 def sync(path: Path) -> None:
-    """Waits until a file, or what names the files of a folder, is on the disk."""
+    """Waits until a file, or the entries of a folder, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -177,9 +177,9 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def place_beside(target: Path) -> Iterator[Path]:
-    """Yields a path of the target's name in a new folder next to it, on the same disk.
+    """Yields a path of the target's name in a temporary folder next to it, on the same disk.
 
-    What is there at the end goes, or is swept once this process is gone.
+    The folder is removed at the end, or swept after this process was killed.
 
     Example:
         >>> import tempfile
@@ -200,10 +200,10 @@ def place_beside(target: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> int:
-    """Removes what killed processes left half written next to the files and folders in a folder.
+    """Removes incomplete files of killed processes next to the files and folders in a folder.
 
     Returns:
-        How many places that were.
+        Number of removed folders.
     """
     swept = 0
     with contextlib.suppress(OSError):
@@ -215,9 +215,9 @@ def sweep(folder: Path) -> int:
 
 
 def _sweep(left: Path) -> bool:
-    """Removes a place whose process is gone."""
+    """Removes a temporary folder whose process has ended."""
     with contextlib.suppress(OSError):
-        left.rmdir()  # an empty one: its process was killed at the first or at the last moment
+        left.rmdir()  # an empty one, of a process that was killed at the beginning or the end
         return True
     held, locks = None, (left / _LOCK).exists()
     try:
@@ -233,7 +233,7 @@ def _sweep(left: Path) -> bool:
 
 
 def _remove(left: Path, held: int | None) -> None:
-    """Removes a place, its lock last: whatever a kill leaves of it is known as dead."""
+    """Removes a temporary folder, its lock last, so that leftovers after a kill can be recognised."""
     with contextlib.suppress(OSError):
         for path in left.iterdir():
             if path.is_dir() and not path.is_symlink():
@@ -246,7 +246,7 @@ def _remove(left: Path, held: int | None) -> None:
 
 
 def _claim(parent: Path) -> tuple[Path, int | None]:
-    """Creates a folder to write to, and its lock; None on a file system without locks, where its age tells."""
+    """Creates a temporary folder and its lock; None on a file system without locks."""
     while True:
         folder = Path(tempfile.mkdtemp(prefix=_WRITING, dir=parent))
         try:

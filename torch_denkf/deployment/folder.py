@@ -1,4 +1,4 @@
-"""A trained filter as a folder: weights that are data only, and a text file that says what builds the filter."""
+"""A trained filter as a folder: weights as data, and a text file with its builder and settings."""
 
 from __future__ import annotations
 
@@ -40,25 +40,24 @@ def save_folder(
     """Writes a model to a folder.
 
     ``weights.safetensors`` gets parameters and buffers; ``config.json`` gets the builder's name, its settings, the
-    SHA-256 of the weights, the versions that wrote both, what is known of the training, and the SHA-256 of all that.
+    SHA-256 of the weights, the versions of the libraries, the record of the training, and a SHA-256 of all these.
 
     Args:
         model: the model.
-        folder: made where it is not there; a model in it is replaced, whole or not at all, also by a process that is
-            killed.
+        folder: created if it does not exist; an existing model is replaced atomically, also if the process is killed.
         builder: name of the function that builds such a model from the settings.
         settings: plain values.
-        training: command, seed, drives: plain values, for the record alone.
-        build: that function, to make sure that it builds such a model; ``None`` for no look.
+        training: command, seed, drives: plain values, for the record only.
+        build: builder function, to check that it builds such a model; ``None`` for no check.
 
     Returns:
         The folder.
 
     Raises:
-        OSError: if the folder cannot be written to, the disk is full, or another process saves to it; a model in it is
-            then as it was.
-        TypeError: if settings or training hold what JSON does not know.
-        ValueError: if ``build`` makes another model; the message names what differs.
+        OSError: if the folder cannot be written to, the disk is full, or another process saves to it; an existing model
+            is then unchanged.
+        TypeError: if settings or training are no JSON values.
+        ValueError: if ``build`` makes another model; the message names the difference.
 
     Example:
         >>> import tempfile
@@ -84,7 +83,7 @@ def save_folder(
     config["sha256"] = hashlib.sha256(weights).hexdigest()
     with locked(folder, ".saving", "is saving to it"):
         _settle(folder)
-        try:  # the new weights lie next to the old ones until one rename, that of the description, changes the model
+        try:  # the new weights are next to the old ones until the rename of the description replaces the model
             write_bytes(_unsettled(folder, config["sha256"]), weights)
             write_text(folder / CONFIG, described(config))
         finally:
@@ -93,7 +92,7 @@ def save_folder(
 
 
 def described(config: Mapping[str, Any]) -> str:
-    """Returns the text of ``config.json``, with a checksum of all that it says."""
+    """Returns the text of ``config.json``, with a checksum of its content."""
     return json.dumps({**config, "checksum": _checksum(config)}, indent=1) + "\n"
 
 
@@ -103,12 +102,12 @@ def _checksum(config: Mapping[str, Any]) -> str:
 
 
 def _unsettled(folder: Path, sha256: object) -> Path:
-    """Returns the place of new weights until a description of them has taken the place of the old one."""
+    """Returns the temporary path of new weights, before their description has replaced the old one."""
     return folder / f"weights-{sha256}.safetensors"
 
 
 def _settle(folder: Path) -> None:
-    """Gives weights that are described their name, and removes those that never were."""
+    """Renames weights that have a description to their final name, and removes others."""
     described = None
     with contextlib.suppress(OSError, ValueError, AttributeError):
         described = _unsettled(folder, json.loads((folder / CONFIG).read_text()).get("sha256"))
@@ -121,11 +120,11 @@ def _settle(folder: Path) -> None:
 
 
 def read_folder_config(folder: str | Path, builders: Mapping[str, object]) -> dict[str, Any]:
-    """Reads what :func:`save_folder` wrote next to the weights.
+    """Reads the description that :func:`save_folder` wrote next to the weights.
 
     Args:
-        folder: with ``config.json``.
-        builders: those that may be named.
+        folder: folder with ``config.json``.
+        builders: allowed builders, by name.
 
     Raises:
         FileNotFoundError: if there is no filter in the folder.
@@ -157,8 +156,8 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
     """Reads a model that :func:`save_folder` wrote. Nothing in the files is executed: they name one of ``builders``.
 
     Args:
-        folder: with ``config.json`` and ``weights.safetensors``.
-        builders: by name, functions of the settings that return an untrained model.
+        folder: folder with ``config.json`` and ``weights.safetensors``.
+        builders: functions of the settings that return an untrained model, by name.
 
     Returns:
         The model, on the CPU, in evaluation mode.
@@ -203,10 +202,10 @@ def load_folder(folder: str | Path, builders: Mapping[str, Callable[..., nn.Modu
 
 
 def _fits(value: Tensor, made: Tensor) -> bool:
-    """Tells whether numbers are of the same kind as those that were built, and infinite only where these are."""
+    """Returns True if values have the kind of the built ones, and are infinite only where these are."""
     if value.is_floating_point() != made.is_floating_point():
         return False
-    if value.shape != made.shape:  # for load_state_dict to say
+    if value.shape != made.shape:  # load_state_dict raises
         return True
     return not bool((~value.isfinite() & ~(made.isinf() & (value == made))).any())
 

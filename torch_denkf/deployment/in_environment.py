@@ -1,4 +1,4 @@
-"""Between an environment's tensordicts and a packaged step, which takes and returns tensors by name."""
+"""Adapter between an environment's tensordicts and a packaged step with tensors by name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["PackagedRun", "Step"]
 
 
 class Step(Protocol):
-    """A packaged step, such as :class:`torch_denkf.deployment.package.PackagedStep`."""
+    """Protocol of a packaged step, such as :class:`torch_denkf.deployment.package.PackagedStep`."""
 
     @property
     def inputs(self) -> Mapping[str, tuple[tuple[int, ...], str]]:
@@ -21,26 +21,26 @@ class Step(Protocol):
 
     @property
     def outputs(self) -> Sequence[str]:
-        """Names of what it returns."""
+        """Returns the names of the outputs."""
 
     def __call__(self, entries: Mapping[str, Tensor], /) -> Mapping[str, Tensor]:
         """Takes one step."""
 
 
 class PackagedRun:
-    """Takes a packaged step's inputs from where an environment's step has them.
+    """Runs a packaged step on the tensordicts of an environment's step.
 
     Args:
-        step: from names to tensors and back, with attributes ``inputs`` and ``outputs``, as
-            :func:`torch_denkf.deployment.load_step` returns it; nested keys are written with dots.
-        carry: keys of the belief at t-1, and under what name the tensordict at the root holds them.
+        step: packaged step with attributes ``inputs`` and ``outputs``, from :func:`torch_denkf.deployment.load_step`;
+            nested keys are joined by dots.
+        carry: maps keys of the belief at t-1 to their keys in the root tensordict.
         controls: keys that are read at the root.
         frames: keys that are read under ``"next"``.
-        optional: keys under ``"next"`` that are read where they are.
-        keep: keys that the step has to return.
+        optional: optional keys under ``"next"``.
+        keep: keys that the step must return.
 
     Raises:
-        KeyError: if the step reads what the environment's step cannot give, or does not return what is to be kept.
+        KeyError: if the step needs an input that the environment's step lacks, or does not return an entry of ``keep``.
     """
 
     def __init__(
@@ -76,11 +76,11 @@ class PackagedRun:
         """Takes a step.
 
         Returns:
-            what is kept, by key; ``None`` if an input is missing.
+            the entries of ``keep``; ``None`` if an input is missing.
 
         Raises:
-            ValueError: if the environment emits something that the filter would use and the package cannot, or a
-                shape or dtype differs from the package's.
+            ValueError: if the environment has an entry that the filter uses and the package does not, or a shape or
+                dtype differs from the package's.
         """
         entries = {name: tensordict.get(key, None) for name, key in self._root}
         for name, key in self._next:

@@ -17,7 +17,7 @@ from torch_denkf.functional.kernels.small_system import LARGEST_ELIMINATED, LARG
 __all__ = ["need_onnx", "onnx_model"]
 
 _OTHERWISE = 'Or write format="pt2", which holds all operators of torch.'
-#: Parts of operators' names, and what does without them.
+#: Parts of operators' names, and alternatives without these operators.
 _CURES = {
     "eigh": 'The scheme "etkf" needs it, and a FusedFilter of an ensemble: choose "perturbed", "sakov" or "sensor".',
     "cholesky|triangular": (
@@ -30,10 +30,10 @@ _CURES = {
 
 
 def need_onnx() -> None:
-    """Checks that the packages are there that write and run ONNX models.
+    """Checks that the packages for ONNX models are installed.
 
     Raises:
-        ImportError: if one is missing; names it and the extra.
+        ImportError: if one is missing; the message names it and the extra.
     """
     missing = [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]
     if missing:
@@ -48,14 +48,15 @@ def onnx_model(
     Args:
         program: the step, without automatic differentiation.
         inputs: names of its inputs, in order.
-        outputs: names of its outputs, in order. What an input is called, too, is ``next.`` and its name in the model.
+        outputs: names of its outputs, in order. Outputs with the name of an input get the prefix ``next.`` in the
+            model.
         signature: description, kept in the model's metadata.
 
     Returns:
         The model; weights are inside.
 
     Raises:
-        RuntimeError: if the step draws random numbers, or has an operator that ONNX lacks; names it.
+        RuntimeError: if the step draws random numbers, or has an operator that ONNX lacks; the message names it.
     """
     for node in program.graph.nodes:
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
@@ -63,7 +64,7 @@ def onnx_model(
                 f"The step draws random numbers itself, with {node.target}. In an ONNX model all noise is an input: "
                 "give the filter process_noise=, or let your module's draw_noise() draw."
             )
-    named = [f"next.{name}" if name in inputs else name for name in outputs]  # in a model a name is given once
+    named = [f"next.{name}" if name in inputs else name for name in outputs]  # names are unique in a model
     try:
         with _quiet():
             written = torch.onnx.export(
@@ -71,11 +72,11 @@ def onnx_model(
             )
     except torch.onnx.OnnxExporterError as error:
         raise RuntimeError(_refusal(error)) from error
-    assert written is not None  # where dynamo=True
+    assert written is not None  # with dynamo=True
     model = written.model
     graph = model.graph
     graph.metadata_props.clear()
-    for node in graph.all_nodes():  # names of files and lines, six times as large as all else
+    for node in graph.all_nodes():  # names of files and lines, six times as large as the rest
         node.metadata_props.clear()
     for value in (*graph.inputs, *graph.outputs, *graph.initializers.values()):
         value.metadata_props.clear()
@@ -99,7 +100,7 @@ def _refusal(error: BaseException) -> str:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silences the exporter's remarks on packages that a step does not use, and on its own code."""
+    """Silences the exporter's messages about unused packages, and about its own code."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     before = [logger.level for logger in loggers]
     for logger in loggers:

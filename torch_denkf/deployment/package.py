@@ -1,4 +1,4 @@
-"""Loading a packaged step. This file imports torch alone: it is what runs on the robot."""
+"""Loads a packaged step. This file imports only torch, and runs on the robot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 SIGNATURE = "torch_denkf"  # name of the description inside a package
 NEEDS_ONNX = 'ONNX models need the extra "onnx": pip install "torch_denkf[onnx]"'
-_MOST_UNPACKED = 50  # times its size, that a package may be; torch does not compress, and text shrinks to a tenth
+_MOST_UNPACKED = 50  # largest ratio of unpacked to packed size; torch does not compress, and text shrinks to a tenth
 
 
 class PackagedStep:
@@ -27,8 +27,8 @@ class PackagedStep:
         signature: names, shapes and dtypes, as :func:`torch_denkf.deployment.export_step` wrote them.
 
     Attributes:
-        inputs: what a call needs, by name: shape and dtype.
-        outputs: names of what it returns.
+        inputs: shape and dtype of each input, by name.
+        outputs: names of the outputs.
         carry: the outputs that are inputs of the next step.
     """
 
@@ -42,12 +42,12 @@ class PackagedStep:
         """Takes one step.
 
         Args:
-            entries: all ``inputs``; others are ignored, so that the last outputs and a new frame can be passed on
+            entries: all ``inputs``; other entries are ignored, so that the last outputs and a new frame can be passed
                 together.
 
         Raises:
             KeyError: if an input is missing.
-            ValueError: if it has another shape or dtype than the package was made for.
+            ValueError: if its shape or dtype differs from the package's.
         """
         nested = [key for key in entries if not isinstance(key, str) or isinstance(entries[key], Mapping)]
         if nested or not isinstance(entries, Mapping):
@@ -65,28 +65,28 @@ class PackagedStep:
                     f"{name!r} must be {dtype} {list(shape)}, got {value.dtype} {list(value.shape)}; a package has "
                     "static shapes: export another one"
                 )
-            values.append(value.contiguous())  # native code reads as the example lay in memory
+            values.append(value.contiguous())  # native code assumes the memory layout of the example
         return dict(zip(self.outputs, self._run(*values), strict=True))
 
 
 def load_step(path: str | Path) -> PackagedStep:
-    """Loads what :func:`torch_denkf.deployment.export_step` wrote.
+    """Loads a package of :func:`torch_denkf.deployment.export_step`.
 
-    A package is a program: loading it runs the native code in it, with all rights of this process, and a package that
-    is not compiled may hold pickles, which run code, too. Load packages alone that you would also execute; nothing in
-    the file is checked against malice. Weights that are data only: :func:`torch_denkf.pretrained.save_pretrained`.
+    A package is a program: loading it executes its native code with all rights of this process, and a package that is
+    not compiled may have pickles, which execute code, too.
 
-    An ONNX model (``.onnx``) holds neither. onnxruntime runs it, on the processor, with as many threads as torch has
-    when the model is loaded.
+    Load only packages that you trust; the file is not checked against malice. For weights as data see
+    :func:`torch_denkf.pretrained.save_pretrained`. An ONNX model (``.onnx``) has neither. onnxruntime runs it, on the
+    processor, with as many threads as torch has when the model is loaded.
 
     Args:
         path: the ``.pt2`` or ``.onnx`` file.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ImportError: for an ONNX model without onnxruntime; names the extra.
-        ValueError: if it is not a packaged step, or one that is damaged.
-        OSError: if there is no space to unpack it; names the folder and its free space.
+        FileNotFoundError: if the file does not exist.
+        ImportError: for an ONNX model without onnxruntime; the message names the extra.
+        ValueError: if it is no packaged step, or damaged.
+        OSError: if there is no space to unpack it; the message names the folder and its free space.
     """
     path = Path(path)
     if not path.is_file():
@@ -102,7 +102,7 @@ def load_step(path: str | Path) -> PackagedStep:
         try:
             run = torch._inductor.aoti_load_package(str(path))
         except RuntimeError as error:
-            # Where torch unpacks it; Python's tempfile passes over folders that are full.
+            # The folder in which torch unpacks it; Python's tempfile skips full folders.
             folder = next(
                 (os.environ[name] for name in ("TMPDIR", "TMP", "TEMP", "TEMPDIR") if name in os.environ), "/tmp"
             )
@@ -118,10 +118,10 @@ def load_step(path: str | Path) -> PackagedStep:
         files = {SIGNATURE: ""}
         try:
             program = torch.export.load(path, extra_files=files)
-        except Exception as error:  # torch, json and pickle have a dozen kinds for a file that is none of theirs
+        except Exception as error:  # torch, json and pickle raise a dozen kinds for invalid files
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise ValueError(f"{path} cannot be loaded ({reason}); export it again") from error
-        # Shapes and dtypes are checked here; torch's own checks fail where an input is not used.
+        # Shapes and dtypes are checked here; torch's checks fail for unused inputs.
         run, signature = program.module(check_guards=False), files[SIGNATURE]
         counts = len(program.graph_signature.user_inputs), len(program.graph_signature.user_outputs)
     if not signature:
@@ -130,10 +130,10 @@ def load_step(path: str | Path) -> PackagedStep:
 
 
 def run_onnx(model: bytes) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
-    """Returns a function that runs an ONNX model on tensors, and its description, empty where it has none.
+    """Returns a function that runs an ONNX model on tensors, and its description, which may be empty.
 
     Raises:
-        ImportError: without onnxruntime; names the extra.
+        ImportError: without onnxruntime; the message names the extra.
         RuntimeError: if it is no such model.
     """
     try:
@@ -145,7 +145,7 @@ def run_onnx(model: bytes) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
     options.log_severity_level = 3  # errors
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # a dozen kinds, of no common class
+    except Exception as error:  # a dozen kinds without a common class
         raise RuntimeError(" ".join(str(error).split())) from error
     names = [each.name for each in session.get_inputs()]
 
@@ -157,10 +157,10 @@ def run_onnx(model: bytes) -> tuple[Callable[..., tuple[Tensor, ...]], str]:
 
 
 def _is_compiled(path: Path) -> bool:
-    """Tells whether a package holds native code; raises if that was changed, since it would end the process.
+    """Returns True if a package has native code; raises if it is damaged, as that could end the process.
 
     Raises:
-        ValueError: if it is no package, or one of its parts does not have its checksum.
+        ValueError: if it is no package, or a part has a wrong checksum.
     """
     again = "export it again"
     try:
@@ -170,7 +170,7 @@ def _is_compiled(path: Path) -> bool:
             if size > _MOST_UNPACKED * path.stat().st_size:
                 raise ValueError(f"it would unpack to {size} bytes")
             damaged = archive.testzip()
-    except Exception as error:  # zipfile has half a dozen kinds for a file that was cut or changed
+    except Exception as error:  # zipfile raises half a dozen kinds for damaged files
         raise ValueError(f"{path} is no package of a step, or it was cut ({error}); {again}") from error
     if damaged is not None:
         raise ValueError(f"{path} is damaged: the checksum of its part {damaged!r} is wrong; {again}")
@@ -181,12 +181,12 @@ def _described(path: Path, text: str, counts: tuple[int, int] | None) -> dict:
     """Returns the description in a package.
 
     Args:
-        path: for the message.
+        path: path for the message.
         text: the description.
-        counts: how many inputs and outputs the package has, where that is known.
+        counts: numbers of inputs and outputs of the package, if known.
 
     Raises:
-        ValueError: if it is none of export_step, or does not fit the package.
+        ValueError: if it is no description of export_step, or does not match the package.
     """
     try:
         found = json.loads(text)

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar in a terminal, a line now and then elsewhere."""
+"""Progress of long tasks: a bar in a terminal, periodic lines elsewhere."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from tqdm import tqdm
 
 __all__ = ["progress_bar"]
 
-SECONDS = 10.0  # between two lines where there is no terminal; shorter work says nothing
+SECONDS = 10.0  # between two lines without a terminal; shorter tasks write none
 
 
 def progress_bar(
     name: str, total: int | None, done: int = 0, *, unit: str = "it", shown: bool = True, every: float = SECONDS
 ) -> Any:
-    """Returns tqdm's bar over ``total`` pieces of work, of which ``done`` are made: a context manager.
+    """Returns tqdm's progress bar over ``total`` items, of which ``done`` are finished, as a context manager.
 
-    In a terminal it is drawn. Elsewhere, in a log file for example, a line is written to stderr every ten seconds,
-    or as often as asked for.
+    Without a terminal, as in a log file, a line is written to stderr every ten seconds, or at another interval.
 
     Args:
-        name: what is done.
-        total: pieces; ``None`` where their number is not known.
-        done: pieces that were made before.
-        unit: what a piece is.
-        shown: whether anything is shown at all.
-        every: seconds between two lines where there is no terminal.
+        name: name of the task.
+        total: number of items; ``None`` if unknown.
+        done: number of finished items.
+        unit: unit of the items.
+        shown: whether to show progress.
+        every: seconds between two lines without a terminal.
 
     Example:
         >>> with progress_bar("fit", 10, shown=False) as bar:
@@ -40,17 +39,17 @@ def progress_bar(
 
 
 class _Lines:
-    """Writes each state of a bar as a line of its own."""
+    """Writes each state of a progress bar as a separate line."""
 
     def __init__(self, file: TextIO):
         self.file = file
 
     def write(self, text: str) -> None:
-        """Writes what is not blank."""
+        """Writes text that is not blank."""
         text = text.strip()
         if text:
             self.file.write(f"{text}\n")
 
     def flush(self) -> None:
-        """Lets readers see it."""
+        """Flushes the file."""
         self.file.flush()

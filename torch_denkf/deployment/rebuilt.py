@@ -1,7 +1,7 @@
-"""Check that a function of settings builds the model that is to be stored with them.
+"""Checks that a builder function makes the model that is saved with its settings.
 
-Parameters and buffers come back from the file. All else does not: the number of members, an analysis' scheme, the keys,
-a function between two layers. So these are compared, and no reading is needed for that.
+Parameters and buffers are loaded from the file. Other attributes are not: the number of members, an analysis' scheme,
+the keys, a function between two layers. These are compared, without running the model.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from torch import nn
 
 __all__ = ["build_from", "check_rebuilt", "differences"]
 
-#: Attributes of how a model runs, not of what it is.
+#: Attributes of a model's execution, which are not compared.
 _OF_A_RUN = ("training", "compiled")
 _PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device, torch.Size)
 
 
 def build_from(builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -> nn.Module:
-    """Calls a function with settings that come from JSON: lists are tuples again."""
+    """Calls a builder with settings from JSON, in which lists become tuples."""
     return builder(**{name: _as_tuples(value) for name, value in settings.items()})
 
 
 def check_rebuilt(model: nn.Module, name: str, builder: Callable[..., nn.Module], settings: Mapping[str, Any]) -> None:
-    """Raises a ``ValueError`` where a function of settings builds another model; the message names what differs."""
+    """Raises a ``ValueError`` if a builder makes another model; the message names the differences."""
     with torch.random.fork_rng(devices=[]):
         built = build_from(builder, settings)
-    for label in ("builder", "settings"):  # which a model gets when it is loaded
+    for label in ("builder", "settings"):  # loaded models have these attributes
         if hasattr(model, label) and not hasattr(built, label):
             setattr(built, label, getattr(model, label))
     found = sorted(differences(model, built))
@@ -46,10 +46,10 @@ def check_rebuilt(model: nn.Module, name: str, builder: Callable[..., nn.Module]
 
 
 def differences(given: nn.Module, built: nn.Module) -> Iterator[str]:
-    """Lists the differences of two models, values of parameters and stored buffers aside.
+    """Lists the differences of two models, except in values of parameters and stored buffers.
 
-    Compared are the modules and their types; names, shapes and dtypes of what is stored; buffers that are not stored;
-    and the attributes without a leading underscore that hold plain values, tensors, functions, or containers of them.
+    It compares the modules and their types; names, shapes and dtypes of stored tensors; buffers that are not stored;
+    and public attributes with plain values, tensors, functions, or containers of these.
 
     Args:
         given: one model.
@@ -93,14 +93,14 @@ def _attributes(module: nn.Module) -> dict[str, Any]:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Tells whether two values are equal; of unknown kinds, whether they are of one type."""
+    """Returns True if two values are equal, or for unknown kinds if their types are equal."""
     if isinstance(one, _PLAIN) or isinstance(other, _PLAIN):
-        return type(one) is type(other) and (one == other or one != one)  # NaN is itself
+        return type(one) is type(other) and (one == other or one != one)  # NaN equals NaN
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
         return _kind(one) == _kind(other) and bool(one.cpu().isclose(other.cpu(), rtol=0, atol=0, equal_nan=True).all())
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
-    if isinstance(one, Sequence) and isinstance(other, Sequence):  # lists come back from JSON as tuples
+    if isinstance(one, Sequence) and isinstance(other, Sequence):  # JSON settings have tuples in place of lists
         return len(one) == len(other) and all(map(_same, one, other))
     if type(one) is not type(other):
         return False
@@ -110,14 +110,14 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _parts(value: Any) -> list[Any]:
-    """Lists the code and the values of a function; nothing for anything else."""
+    """Lists the code and the values of a function; empty for other objects."""
     if isinstance(value, functools.partial):
         return [value.func, value.args, value.keywords]
-    if isinstance(value, types.CodeType):  # without the line that it stands in
+    if isinstance(value, types.CodeType):  # ignores line numbers
         return [value.co_code, value.co_names, value.co_consts]
     if isinstance(value, types.FunctionType):
         inside = [cell.cell_contents for cell in value.__closure__ or ()]
-        # A network that a function uses has values of its own, which only a module stores.
+        # Networks in a closure are not compared: only modules store their values.
         return [value.__code__, value.__defaults__, [part for part in inside if not isinstance(part, nn.Module)]]
     return []
 

@@ -1,4 +1,4 @@
-"""The measurement update of an ensemble whose columns lie in several processes, as a TensorDict module."""
+"""Measurement update of an ensemble whose state components are distributed over processes."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ __all__ = ["ShardedEnsembleAnalysis"]
 
 
 class ShardedEnsembleAnalysis(EnsembleAnalysis):
-    """:class:`EnsembleAnalysis` of a state that is spread over processes.
+    """:class:`EnsembleAnalysis` of a state that is distributed over processes.
 
     The mathematics is :func:`~torch_denkf.functional.kernels.sharded.analyse_sharded`.
 
     Each process, as ``torchrun`` starts them, runs the same filter on its own components of the state and of the
-    observation, with the same number of members. ``nis`` and ``log_likelihood`` are those of all components; everything
-    else is the process's own. All processes must step together. No gradients: use it for running, not for learning.
+    observation, with the same number of members. ``nis`` and ``log_likelihood`` are those of all components; other
+    outputs are those of the process.
 
-    Results are those of one process that holds the whole state, up to rounding. An analysis of 32 members and 10⁷
-    components, of which a tenth is observed, takes two processes of one machine 2.0 s and 2.6 GB each. One process
-    takes 2.2 s and 4.8 GB (four shared cores; ``python -m torch.distributed.run --nproc_per_node=2`` starts two).
+    All processes must step together. There are no gradients: use it for inference, not for training. Results equal
+    those of one process with the whole state, up to rounding. An analysis of 32 members and 10⁷ components, of which a
+    tenth is observed, takes two processes of one machine 2.0 s and 2.6 GB each. One process takes 2.2 s and 4.8 GB
+    (four shared cores; ``python -m torch.distributed.run --nproc_per_node=2`` starts two).
 
     Args:
         scheme: ``"sensor"``, ``"etkf"`` or ``"sakov"``, as in :class:`EnsembleAnalysis`.
-        inflation: factor on the analysis anomalies, where anything is observed, by whichever process; 1 for none.
+        inflation: factor on the analysis anomalies, if any process observes anything; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         group: the processes; ``None`` for all.
         **keys: see :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`.
 
     Raises:
-        ValueError: for the scheme ``"perturbed"``, whose draws would be the same in processes of one seed.
-        RuntimeError: from a step where ``torchrun`` started several processes that do not know of each other yet
-            (``torch.distributed.init_process_group``), or where a gradient is required.
+        ValueError: for the scheme ``"perturbed"``, whose draws would be equal in processes with the same seed.
+        RuntimeError: in a step, if ``torchrun`` started several processes without
+            ``torch.distributed.init_process_group``, or if a gradient is required.
 
     Source:
         Hunt, Kostelich & Szunyogh 2007, Physica D 230, for the analysis in ensemble space.

@@ -12,10 +12,10 @@ __all__ = ["follow_parent"]
 
 
 def follow_parent() -> None:
-    """Makes a worker, which was spawned, end when its parent ends, however that ends.
+    """Ends a spawned worker when its parent ends, also after a kill.
 
-    Workers of a parent that was killed would wait for work for ever. Call it in a pool's initializer. Ctrl-C is then
-    the parent's alone, which must see to it that its workers end.
+    Otherwise workers of a killed parent would wait for ever. Call it in a pool's initializer. Only the parent then
+    handles Ctrl-C, and must end its workers.
     """
     parent = multiprocessing.parent_process()
     if parent is None:

@@ -1,4 +1,4 @@
-"""Raises where another transform of an environment writes over the belief that a filter goes on with."""
+"""Checks that no later transform of an environment overwrites a filter's carry."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["check_behind"]
 
 
 def check_behind(transform: Transform, carry: Sequence[NestedKey]) -> None:
-    """Raises where a transform behind a filter's one writes over what the filter carries from step to step.
+    """Raises if a transform after the filter's transform overwrites the filter's carry.
 
-    One that casts a type does not: its inverse casts it back. What an environment outside of a batched one does, as
-    around a ``ParallelEnv``, is not seen.
+    Casts of a dtype are allowed, as their inverse casts back. Transforms outside of a batched environment, as around a
+    ``ParallelEnv``, are not checked.
 
     Args:
         transform: of the filter.

@@ -1,4 +1,4 @@
-"""A look at the first picture that a sensor reads."""
+"""Checks the brightness of the first image of a sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TOO_BRIGHT = 10.0
 
 
 def look_at_brightness(key: NestedKey, pixels: torch.Tensor) -> bool:
-    """Warns where pixels in floating point are far from [0, 1]; tells whether there was anything to look at.
+    """Warns if floating pixels are far from [0, 1]; returns False if there were no values to check.
 
     Args:
         key: of the pixels, for the message.

@@ -1,4 +1,4 @@
-"""Warns where a variance of the belief stands at the filter's ceiling."""
+"""Warns if a variance of the belief has reached the filter's ceiling."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["CeilingReached"]
 
 
 class CeilingReached(Once):
-    """Warns once where a variance is clamped to ``variance_ceiling``; it does not wait for a GPU."""
+    """Warns once if a variance is clamped to ``variance_ceiling``, without waiting for a GPU."""
 
     def __call__(self, filter: Filter, record: Record) -> None:
         """Looks at the variances that a filter wrote."""

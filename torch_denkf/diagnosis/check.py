@@ -1,4 +1,4 @@
-"""A check of analyses, one's own or the library's: on a linear Gaussian system the Kalman update is known."""
+"""Checks an analysis against the exact Kalman update of a linear Gaussian system."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch_denkf.submodel import Update, role
 
 __all__ = ["check_analysis"]
 
-_ROUNDING = 1e-3  # what may be off where nothing is estimated, in standard deviations; float32 is far below
+_ROUNDING = 1e-3  # tolerance of deterministic results, in standard deviations; far above float32 rounding
 
 
 def check_analysis(
@@ -42,7 +42,7 @@ def check_analysis(
     The forecast is Gaussian with the ensemble ``("forecast", "ensemble")``, its sample moments ``("forecast", "mean")``
     and ``("forecast", "cov")``, and equal ``("forecast", "log_weight")``. The observation is the first O components of
     the state, ``("forecast", "observation")``, so that an analysis with an observation model of its own needs
-    ``LinearObservation(torch.eye(O, S))``. What is checked, as far as the analysis writes it:
+    ``LinearObservation(torch.eye(O, S))``. These properties are checked, as far as the analysis has the outputs:
 
     * mean, variances, covariance of the ensemble, innovation, NIS and log-likelihood are those of the Kalman update;
     * ``reading_keys`` names the reading, so that a filter can leave it out;
@@ -171,7 +171,7 @@ class _Case(NamedTuple):
 
 
 def _checks(analysis: TensorDictModuleBase, case: _Case, tolerance: float) -> Iterator[tuple[str, float, float]]:
-    """Names of numbers, how far they are off, and how far they may be."""
+    """Yields names of numbers, how far they are off, and how far they may be."""
     keys, td = case.keys, case.draw((2,))
     yield from _moments("", analysis, case, td, tolerance)
     for batch in ((), (3,), (2, 3)):

@@ -1,4 +1,4 @@
-"""Warns where an ensemble has become too narrow for its observations."""
+"""Warns of ensemble collapse: a spread that is too narrow for the observations."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from torch_denkf.submodel import Entries
 
 __all__ = ["NarrowEnsemble"]
 
-#: Readings of the second half of a sequence that it takes, and how far the median one lies off, in standard deviations.
+#: Least number of readings in the second half of a sequence; the median innovation that warns, in standard deviations.
 _READINGS, _FAR = 20, 4.0
-#: Members of whom chance correlations are small.
+#: Number of members from which spurious correlations are small.
 _MANY = 100
 
 
 class NarrowEnsemble(Once):
-    """Warns once of each update whose observations mostly lie far outside of what the ensemble expects.
+    """Warns once for each update whose median normalised innovation is far above one.
 
-    It looks at sequences without gradients: at the median, which outliers do not move, of the second half of the
-    steps, when a wrong start is over.
+    It checks sequences without gradients. The median is robust to outliers, and the second half of the steps excludes
+    the effect of a wrong initial belief.
     """
 
     ways = ("sequence",)
 
     def __call__(self, filter: Filter, record: Record) -> None:
-        """Looks at innovations; updates whose diagnostics are not kept are not looked at."""
+        """Checks the innovations of each update whose diagnostics are kept."""
         if torch.is_grad_enabled():
             return
         structure, outputs = filter.structure, record.written
@@ -61,24 +61,24 @@ def _look(
         told = torch.corrcoef(torch.cat([predicted[:, number : number + 1], members], -1).T)[0, 1:]
         most = int(told.abs().nan_to_num().argmax())
         spread = float(members.std(0)[most])
-        component = f" Number {number} tells most of component {most} of the state, of standard deviation {spread:.2g}."
+        component = f" Component {number} correlates most with state component {most}, whose spread is {spread:.2g}."
     messages.warn(
         f"narrow at {place!r}",
-        f"The ensemble is too narrow for the readings {module.in_keys[2]!r} at place {place!r}: half of them lie more "
-        f"than {float(median):.1f} standard deviations from what it expects.{component} {_causes(members)}",
+        f"The ensemble is too narrow for the readings {module.in_keys[2]!r} at place {place!r}: half of the "
+        f"innovations exceed {float(median):.1f} predicted standard deviations.{component} {_causes(members)}",
     )
 
 
 def _causes(members: Tensor | None) -> str:
-    """Lists what makes an ensemble too narrow, and the cure of each."""
+    """Returns the possible causes of a narrow ensemble, each with its cure."""
     causes = [
         "The noise of these readings, or that of the motion, may be too small.",
-        "An outlier, or a jump, may have taken the belief away: put a gate around the filter, Gated(filter), which "
-        "takes less of outliers, and opens after patience= such readings.",
+        "Outliers, or a jump, may have displaced the belief: put a gate around the filter, Gated(filter), which "
+        "rejects or down-weights outliers, and opens after patience= such readings.",
     ]
     if members is None or members.shape[-2] < _MANY:
         causes.append(
-            "Chance correlations of few members shrink what fast sensors say nothing about: take "
+            "Spurious correlations of few members shrink the spread of unobserved components: use "
             'EnsembleAnalysis(localisation="significance").'
         )
     return " ".join(causes)

@@ -1,4 +1,4 @@
-"""Raises where modules do not compose: one would undo what another wrote, or nobody would use it."""
+"""Checks that the modules of a filter compose: no output is overwritten or unused."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["check_composition"]
 
 
 def check_composition(modules: Sequence[Placed], structure: Structure) -> None:
-    """Raises where a filter's modules would lose or overwrite an entry.
+    """Raises if a filter's modules would lose or overwrite an entry.
 
     Args:
         modules: in the order in which they were given.
@@ -34,7 +34,7 @@ def check_composition(modules: Sequence[Placed], structure: Structure) -> None:
 
 
 def _check_both(read: Sequence[NestedKey], carry: Sequence[NestedKey], modules: Sequence[Placed]) -> None:
-    """Raises where an entry comes from outside and is written, too: the next step would read what this one wrote."""
+    """Raises if an entry is an input and an output: the next step would read this step's output."""
     for place, module in modules:
         both = [key for key in writes(module) if key in read and key not in carry]
         if both:
@@ -46,7 +46,7 @@ def _check_both(read: Sequence[NestedKey], carry: Sequence[NestedKey], modules: 
 
 
 def _check_unread_masks(modules: Sequence[Placed]) -> None:
-    """Raises where a module marks readings as missing, and no module looks at its mask."""
+    """Raises if a module writes an observed mask that no module reads."""
     read = {key for _, module in modules for key in chain(*reads(module))}
     for place, module in modules:
         for key in marks_of(module):
@@ -58,7 +58,7 @@ def _check_unread_masks(modules: Sequence[Placed]) -> None:
 
 
 def _check_overwriting(modules: Sequence[Placed]) -> None:
-    """Raises where all that a module writes is written again before anybody has read it."""
+    """Raises if all outputs of a module are overwritten before any module has read them."""
     for index, (place, module) in enumerate(modules):
         info = role(module, Update).info_prefix
         unread = {key for key in writes(module) if info is None or key[0] != info}
@@ -76,7 +76,7 @@ def _check_overwriting(modules: Sequence[Placed]) -> None:
 
 
 def _check_unused(update: Sequence[Placed], belief: Sequence[NestedKey]) -> None:
-    """Raises where nobody uses what an analysis writes: its reading would be lost."""
+    """Raises if no module uses the output of an analysis: its reading would have no effect."""
     used = set(belief)
     for place, module in reversed(update):
         info = role(module, Update).info_prefix
@@ -91,7 +91,7 @@ def _check_unused(update: Sequence[Placed], belief: Sequence[NestedKey]) -> None
 
 
 def _check_nesting(read: Sequence[NestedKey], written: Sequence[NestedKey]) -> None:
-    """Raises where a tensor would have to hold another entry."""
+    """Raises if the key of a tensor is also the prefix of another entry."""
     names = set(read) | set(written)
     for key in written:
         for length in range(1, 1 if isinstance(key, str) else len(key)):

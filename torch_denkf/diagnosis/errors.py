@@ -1,4 +1,4 @@
-"""Explains errors: what was read, in which precision, and what is missing."""
+"""Explains errors by inputs, precision and missing entries."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["entry_of", "explained", "missing_entry"]
 
 
 def explained(module: SubModel, error: Exception, entries: Entries) -> Exception:
-    """Returns an error with what a sub-model read, and its constants, in the message; one of another kind as it is.
+    """Adds a sub-model's inputs and constants to an error's message; leaves other errors unchanged.
 
     Raises:
         TypeError: if entries and parameters differ in precision, or a mask is not boolean.
@@ -26,7 +26,7 @@ def explained(module: SubModel, error: Exception, entries: Entries) -> Exception
 
 
 def _what_there_was(module: SubModel, entries: Entries) -> str:
-    """Names what was read, and constants, with their shapes."""
+    """Lists inputs and constants, with their shapes."""
     values = {key: entries.get(key) for key in (*module.in_keys, *module.optional_keys)}
     read = [_shown(key, value) for key, value in values.items() if isinstance(value, Tensor)]
     named = (*module.named_buffers(recurse=False), *module.named_parameters(recurse=False))

@@ -32,7 +32,7 @@ def check_inputs(
     *,
     carry: bool = True,
 ) -> None:
-    """Raises a ``KeyError`` that names what the modules miss, who reads it, and the given entries.
+    """Raises a ``KeyError`` that names the missing entries, the modules that read them, and the given entries.
 
     Args:
         structure: of the filter.

@@ -1,4 +1,4 @@
-"""Looks at the times and numbers of a log, and warns of those that no sensor writes.
+"""Checks the times and values of a log, and warns of implausible ones.
 
 All warnings have one form: the file or log, the column, what was seen, and the argument that cures it.
 """
@@ -43,7 +43,7 @@ _READERS = ("torch_denkf", "torchrl", "tensordict")  # torchrl's data sets are m
 
 
 def warn_of_log(place: object, column: str, seen: str, cure: str) -> None:
-    """Warns of a column of a log, at the line outside of the library that had it read."""
+    """Warns of a column of a log; the warning points to the caller's line outside of the library."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _READERS:
         frame, level = frame.f_back, level + 1
@@ -53,7 +53,7 @@ def warn_of_log(place: object, column: str, seen: str, cure: str) -> None:
 def look_at_times(
     times: np.ndarray, place: object, column: str, unit: str | None = "s", looks: Collection[str] = LOOKS
 ) -> None:
-    """Warns of times that stand in another unit, go back, have gaps as of another clock, or come in bursts.
+    """Warns of times in a wrong unit, out of order, with gaps as of another clock, or in bursts.
 
     Args:
         times: s, ``[n]``, in the order of the log; it may be a random one.
@@ -137,7 +137,7 @@ def _gap(moments: np.ndarray) -> tuple[str, str] | None:
 def look_at_numbers(
     values: np.ndarray, columns: Sequence[str], place: object, cure: str = "", dtype: torch.dtype = torch.float32
 ) -> bool:
-    """Warns of columns whose steps the dtype that they are handed out in does not resolve.
+    """Warns of columns whose steps the output dtype does not resolve.
 
     Args:
         values: ``[n, C]``, float64.
@@ -184,7 +184,7 @@ def look_at_numbers(
 
 
 def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -> None:
-    """Warns of columns that repeat their last reading in row after row, until the next one comes.
+    """Warns of columns that repeat their last reading until the next one arrives.
 
     A column that moves by its smallest step most of the time is one of coarse numbers, such as a temperature or an
     encoder's ticks, and its rows are readings.
@@ -220,7 +220,7 @@ def look_at_repeats(values: np.ndarray, columns: Sequence[str], place: object) -
 
 
 def repeats(column: np.ndarray) -> bool:
-    """Tells whether a column repeats its last reading until the next one comes."""
+    """Returns True if a column repeats its last reading until the next one arrives."""
     moves = np.diff(column)
     changes = np.flatnonzero(moves)
     if len(changes) < 5 or np.median(np.diff(changes)) < 2:
@@ -230,7 +230,7 @@ def repeats(column: np.ndarray) -> bool:
 
 
 def in_origin(values: np.ndarray, origin: object, place: str) -> np.ndarray:
-    """Subtracts an origin in float64, before numbers lose their digits.
+    """Subtracts an origin in float64, before the conversion to a shorter dtype.
 
     Args:
         values: ``[n, C]``.

@@ -1,4 +1,4 @@
-"""Warns where an observed mask hides observations, and a module uses them all the same."""
+"""Warns if a module uses observations that an observed mask marks as missing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _OWN_MASK = "_observed"
 
 
 class UnreadMasks(Once):
-    """Warns once of each mask that hides observations which a module of the filter uses all the same.
+    """Warns once of each observed mask that a module of the filter ignores.
 
     Such a mask is one that no module reads, one that is spelt otherwise, that of a table whose values are held until
     the next arrives, or one that a transform of the environment writes.
@@ -41,7 +41,7 @@ class UnreadMasks(Once):
         self._known: tuple[Structure | None, list[Any], list[tuple[NestedKey, NestedKey]]] = (None, [], [])
 
     def __call__(self, filter: Filter, record: Record) -> None:
-        """Looks at the masks in what a filter read."""
+        """Looks at the masks in the inputs of a filter."""
         structure, tensordict, name = filter.structure, record.tensordict, type(filter).__name__
         if self._known[0] is not structure:
             self._known = structure, list(_unmasked(structure)), [(key, _own(key)) for key in structure.readings]
@@ -108,7 +108,7 @@ class UnreadMasks(Once):
         mask: Tensor,
         name: str,
     ) -> None:
-        """Warns where a table's forward-filled value would be used as a new observation.
+        """Warns if a table's forward-filled value would be used as a new observation.
 
         Whether the filter's masks hide it, too, is looked at where the filter reads no other mask than ``"observed"``.
         """
@@ -125,7 +125,7 @@ class UnreadMasks(Once):
             )
 
     def _of_transforms(self, structure: Structure, env, name: str) -> None:
-        """Warns where a transform drops what the filter reads, and marks that in a mask the filter does not read."""
+        """Warns if a transform drops the inputs of the filter, and marks that in a mask the filter does not read."""
         read = {*structure.needed, *structure.optional}
         while isinstance(env, TransformedEnv):
             transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]

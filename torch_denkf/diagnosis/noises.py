@@ -1,4 +1,4 @@
-"""Raises where a noise is no covariance, and warns where a sequence ends in NaN."""
+"""Raises if a noise is no covariance, and warns if a sequence ends in NaN."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _ROUNDING = 1e-4
 
 
 class WrongNoise(Once):
-    """Raises where the noise of a reading, or a variance of the belief, is negative, and warns of NaN in a sequence.
+    """Raises if the noise of a reading, or a variance of the belief, is negative, and warns of NaN in a sequence.
 
-    A noise that a mask hides is not looked at. With ``check_finite=False`` nothing is.
+    Noise of missing observations is not checked. ``check_finite=False`` disables all checks.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class WrongNoise(Once):
         self._known: tuple[Structure | None, list[NoiseEntry], list[NestedKey]] = (None, [], [])
 
     def __call__(self, filter: Filter, record: Record) -> None:
-        """Looks at what a run read and wrote.
+        """Checks the inputs and outputs of a run.
 
         Raises:
             ValueError: that names the entry and the row.
@@ -93,7 +93,7 @@ class WrongNoise(Once):
         )
 
     def _warn_of_nan(self, filter: Filter, record: Record) -> None:
-        """Names the cause of the first NaN of a sequence, which goes on to its end."""
+        """Names the cause of the first NaN of a sequence, which continues to its end."""
         structure, dims = filter.structure, len(record.batch_size)
         made = [record.written.get(kind.key(name)) for kind in structure.kinds for name in ("mean", "var")]
         wrong = [value.isnan().any(-1) for value in made if value is not None and not value.is_cuda]

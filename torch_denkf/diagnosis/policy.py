@@ -1,4 +1,4 @@
-"""Warns where a filter in a policy starts from a belief that is not its own."""
+"""Warns if a filter in a policy starts from a belief that is not its own."""
 
 from __future__ import annotations
 

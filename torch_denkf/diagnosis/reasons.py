@@ -43,7 +43,7 @@ class NoiseEntry(NamedTuple):
 
     Attributes:
         key: of the variances ``[*B, O]`` or the covariance ``[*B, O, O]``.
-        mask: of the observed mask that hides it; ``None`` where there is none.
+        mask: of the observed mask that hides it; ``None`` if there is none.
     """
 
     key: NestedKey
@@ -63,11 +63,11 @@ def noises_of(structure: Structure) -> list[NoiseEntry]:
 
 
 def no_covariance(noise: Tensor, mask: Tensor | None, batch_dims: int, *, strict: bool = False) -> Tensor:
-    """Tells in which rows a noise whose numbers are finite is no covariance, ``[*B]``.
+    """Masks rows in which a finite noise is no covariance, ``[*B]``.
 
     Args:
         noise: variances ``[*B, O]`` or covariances ``[*B, O, O]``.
-        mask: ``[*B, 1]`` or ``[*B, O]``; what it hides may be anything.
+        mask: ``[*B, 1]`` or ``[*B, O]``; noise of missing components is ignored.
         batch_dims: dimensions of ``*B``.
         strict: whether zero is no variance.
     """
@@ -82,7 +82,7 @@ def no_covariance(noise: Tensor, mask: Tensor | None, batch_dims: int, *, strict
 
 
 def flaw_of(noise: Tensor, mask: Tensor | None = None) -> str:
-    """Describes what keeps one noise, ``[O]`` or ``[O, O]``, from being a covariance."""
+    """Describes why a noise, ``[O]`` or ``[O, O]``, is no covariance."""
     noise = noise.detach()
     variances = noise if noise.ndim == 1 else noise.diagonal()
     shown = torch.where(mask.expand(variances.shape), variances, torch.inf) if mask is not None else variances
@@ -103,8 +103,8 @@ def why_not_finite(structure: Structure, entries: Entries, written: Entries) -> 
 
     Args:
         structure: of the filter.
-        entries: what the step read.
-        written: what it wrote.
+        entries: inputs of the step.
+        written: outputs of the step.
     """
     why = bad_inputs(structure, entries, written) or _of_first_row(structure, entries, written)
     return (
@@ -116,12 +116,12 @@ def why_not_finite(structure: Structure, entries: Entries, written: Entries) -> 
 
 
 def cure_of(why: str) -> str:
-    """Returns what a covariance is, where that is the reason."""
+    """Returns the definition of a covariance, if that is the reason."""
     return f"{COVARIANCE} " if "no covariance" in why else ""
 
 
 def bad_inputs(structure: Structure, entries: Entries, written: Entries) -> str:
-    """Names inputs that are not finite and that no mask hides, and flaws of the belief that was given."""
+    """Names observed inputs that are not finite, and flaws of the given belief."""
     kinds, bad = dict(structure.carried), []
     masks = {
         unravel_key(key): unravel_key(part.observed_key)
@@ -146,13 +146,13 @@ def bad_inputs(structure: Structure, entries: Entries, written: Entries) -> str:
 
 
 def _hides(mask: Tensor, value: Tensor) -> bool:
-    """Tells whether a mask ``[*B, 1]`` or ``[*B, O]`` fits a value ``[*B, O]``, ``[*B, E, O]`` or ``[*B, O, O]``."""
+    """Returns True if a mask ``[*B, 1]`` or ``[*B, O]`` fits a value ``[*B, O]``, ``[*B, E, O]`` or ``[*B, O, O]``."""
     batch = mask.shape[:-1]
     return value.shape[: len(batch)] == batch and mask.shape[-1] in (1, value.shape[-1])
 
 
 def _shown(mask: Tensor, value: Tensor) -> Tensor:
-    """Marks what a mask shows of a value; of a covariance ``[*B, O, O]`` rows and columns."""
+    """Marks the observed part of a value; of a covariance ``[*B, O, O]`` rows and columns."""
     if value.ndim == mask.ndim:
         return mask
     square = value.shape[-1] == value.shape[-2]
@@ -191,7 +191,7 @@ def reason(structure: Structure, entries: Entries, written: Entries) -> str:
 
 
 def _noise(structure: Structure, now: Entries, *, strict: bool = False) -> str:
-    """Names a reading's noise that is no covariance, or is zero where that may be the reason."""
+    """Names the noise of a reading if it is no covariance, or is zero and may be the cause."""
     for noise in noises_of(structure):
         value, mask = now.get(noise.key), None if noise.mask is None else now.get(noise.mask)
         if value is not None and bool(no_covariance(value, mask, 0, strict=strict)):
@@ -201,7 +201,7 @@ def _noise(structure: Structure, now: Entries, *, strict: bool = False) -> str:
 
 
 def named(structure: Structure, key: NestedKey) -> str:
-    """Names an entry, and the module that made it, of what."""
+    """Names an entry, the module that wrote it, and that module's inputs."""
     for place, module in structure.modules:
         if key in writes(module):
             return f"{key!r}, which {_kind(module)} at {place!r} makes of {reads(module)[0]}"
@@ -209,7 +209,7 @@ def named(structure: Structure, key: NestedKey) -> str:
 
 
 def _kind(module: torch.nn.Module) -> str:
-    """Names the class of a module, inside of what only renames its keys or adds to them."""
+    """Names the class of a module, inside wrappers that only rename keys or add some."""
     while isinstance(module, Wrapper) and isinstance(module.module, TensorDictModuleBase):
         module = module.module
     return type(module).__name__
@@ -236,7 +236,7 @@ def _no_point(structure: Structure, now: Entries) -> str:
 
 
 def _process_noise(structure: Structure, now: Entries) -> str:
-    """Names the process noise, which is made again, where it is no covariance."""
+    """Names the process noise, which is computed again, if it is no covariance."""
     place, transition = structure.transition
     work = dict(now)
     for kind in structure.kinds:
@@ -269,7 +269,7 @@ def _noise_modules(transition: torch.nn.Module) -> Iterator[tuple[SubModel, Tens
 
 
 def _module(structure: Structure, entries: Entries, written: Entries) -> str:
-    """Names the first module that makes a number that is not finite of numbers that are, and what the step read."""
+    """Names the first module whose outputs are not finite though its inputs are, and the step's inputs."""
     before = dict(entries)
     place, module = structure.transition
     blamed = ""

@@ -1,4 +1,4 @@
-"""Raises where an observation has dimensions that neither the batch nor an ensemble has."""
+"""Raises if an observation has dimensions that neither the batch nor an ensemble has."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["ReadingRanks"]
 
 
 class ReadingRanks(Once):
-    """Raises where an observation of several robots would be broadcast against the belief of one."""
+    """Raises if an observation of several robots would be broadcast against the belief of one."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Raises where a flat batch holds several sequences end to end and does not mark where each begins."""
+"""Raises if a flat batch has several concatenated sequences without marks of their beginnings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CURE = (
 
 
 class UnmarkedSlices(Once):
-    """Raises where the batch of a loss holds slices of episodes end to end, and nothing marks where they begin."""
+    """Raises if the batch of a loss has concatenated slices of episodes without marks of their beginnings."""
 
     ways = ("data",)
 
@@ -40,7 +40,7 @@ def check_slices(tensordict: TensorDictBase, init_key: NestedKey) -> None:
     """Raises for a batch ``[N]`` that seems to hold several sequences and does not say where they begin.
 
     A filter would go from the end of one slice to the beginning of the next as if no time had passed. Frames without a
-    ``"next"`` part, a number of the episode and a clock are taken for one sequence, and so is what goes on without a
+    ``"next"`` part, a number of the episode and a clock are taken for one sequence, and so is what continues without a
     break: what was next at one step is there at the following one, as in ``env.rollout``.
 
     Args:
@@ -131,10 +131,10 @@ def _end(following: TensorDictBase, size: int) -> Tensor | None:
 
 
 def _chain(tensordict: TensorDictBase, following: TensorDictBase, inner: Tensor) -> tuple[bool, Tensor]:
-    """Compares the next step's entries with what follows: whether that is possible, and breaks ``[N - 1]``.
+    """Compares the next step's entries with the following rows: whether that is possible, and breaks ``[N - 1]``.
 
     A transform of sampled data may change one entry and not its next one, and a robot may stand still. So one entry
-    that moves and goes on is enough, and a step in which all are the same.
+    that moves and continues is enough, and a step in which all are the same.
     """
     pairs = []
     for key in map(unravel_key, following.keys(True, True)):

@@ -1,7 +1,4 @@
-"""Environments: toy systems and replays; transforms that disturb frames, lose them, or hold the last one.
-
-They know nothing about filters.
-"""
+"""Environments: toy systems and replays; transforms that disturb or drop frames, or hold the last one."""
 
 import lazy_loader
 

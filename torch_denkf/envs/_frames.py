@@ -1,4 +1,4 @@
-"""Base of transforms of frames: keys, chance, resets, data, and pictures by the chunk."""
+"""Base classes of transforms of frames and images."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torchrl.envs.transforms import Transform
 from torch_denkf._arguments import Checked
 from torch_denkf._registered import diagnosis
 
-CHUNK = 2**20  # values in work at a time: 4 MB in float32
+CHUNK = 2**20  # values per chunk: 4 MB in float32
 
 
 class FrameTransform(Checked, Transform):
-    """Does something to frames, each with probability ``p``, in an environment (steps, resets) and in data.
+    """Base class of transforms that change each frame with probability ``p``, in environments and in data.
 
-    Subclasses write ``_call``. Data are never changed themselves: :meth:`forward` works on a shallow copy, since a
-    drive is a read-only memory map.
+    Subclasses implement ``_call``. Data are not changed in place: :meth:`forward` works on a shallow copy, as a drive
+    may be a read-only memory map.
 
     Args:
-        p: probability that a frame is hit.
+        p: probability that a frame is changed.
         in_keys: entries of the frame.
         generator: source of randomness; torch's global one by default.
 
@@ -47,7 +47,7 @@ class FrameTransform(Checked, Transform):
         return frame
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Transforms frames of data: a sample of a replay buffer, or a whole drive; the argument stays as it is."""
+        """Transforms frames of data: a sample of a replay buffer, or a whole drive; the argument is not changed."""
         return self._call(tensordict.copy())
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -55,10 +55,10 @@ class FrameTransform(Checked, Transform):
 
 
 class ImageDisturbance(FrameTransform):
-    """Changes pictures ``[*B, C, H, W]``: uint8 in [0, 255] or floating in [0, 1], whatever the batch dimensions.
+    """Base class of disturbances of images ``[*B, C, H, W]``: uint8 in [0, 255] or floating in [0, 1].
 
-    Subclasses write ``_disturb``, of frames ``[n, C, H, W]`` to new ones of the same shape and dtype; it gets as many
-    frames at a time as :data:`CHUNK` allows. Each entry of ``in_keys`` is a camera of its own, with its own draws.
+    Subclasses implement ``_disturb``, which maps frames ``[n, C, H, W]`` to new ones of the same shape and dtype, in
+    chunks of :data:`CHUNK` values. Each entry of ``in_keys`` is a separate camera with independent draws.
     """
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -84,7 +84,7 @@ class ImageDisturbance(FrameTransform):
         raise NotImplementedError
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Changes nothing; raises for entries that can be negative: those are no pictures.
+        """Returns the spec unchanged; raises for entries that can be negative, which are no images.
 
         Raises:
             ValueError: if an entry's lowest value is negative.
@@ -106,11 +106,11 @@ def scale_of(frames: Tensor) -> float:
 
 
 def to_float(frames: Tensor) -> Tensor:
-    """Returns frames in a dtype to calculate in: float64 stays, all else becomes float32; values keep their scale."""
+    """Converts frames to a floating dtype: float64 is kept, others become float32; values keep their scale."""
     return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
 
 
 def to_dtype(values: Tensor, like: Tensor) -> Tensor:
-    """Returns values back in the dtype of the frames, rounded and held in [0, white]."""
+    """Converts values back to the dtype of the frames, rounded and clamped to [0, white]."""
     values = values if like.is_floating_point() else values.round()
     return values.clamp(0.0, scale_of(like)).to(like.dtype)

@@ -1,4 +1,4 @@
-"""Base of simulated environments: a random generator of their own, on their device."""
+"""Base class of simulated environments, with a random generator on the environment's device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["SeededEnv"]
 
 
 class SeededEnv(EnvBase):
-    """An environment that draws from a generator of its own, ``rng``, which restarts where it moves to a device."""
+    """Draws from the generator ``rng`` instead of the global one; ``rng`` is seeded again when the device changes."""
 
     rng: torch.Generator
 
@@ -17,7 +17,7 @@ class SeededEnv(EnvBase):
         self.rng = torch.Generator().manual_seed(0 if seed is None else seed)
 
     def _source(self, like: torch.Tensor) -> dict:
-        """Returns where to draw numbers next to ``like``, as arguments of ``torch.rand``."""
+        """Returns the device of ``like`` and a generator on it, as arguments of ``torch.rand``."""
         if like.is_meta:
             return {"device": like.device}
         if self.rng.device != like.device:

@@ -1,11 +1,11 @@
-"""Disturbances of a camera's pictures: dead and hot pixels, defocus, light, blackouts, dirt.
+"""Disturbances of a camera's images: dead and hot pixels, defocus, exposure, black frames, occlusion.
 
-The first two and the box are the robustness tests of the DEnKF paper's KITTI code, as shares of the picture instead of
-pixels of 1242 x 375, so that they fit any size. Pictures are ``[*B, C, H, W]``, uint8 in [0, 255] or floating in
-[0, 1], and keep their dtype; every frame has its own draws. Append a disturbance to an environment that emits frames
-(after ``ToTensorImage``), or call it on data. What follows from frames must be made of the disturbed ones: of a drive
-disturb the ``image``, whose difference images :func:`torch_denkf.applications.car.kitti.frames.drive_frames` and
-:class:`torch_denkf.applications.car.KITTIReplayEnv` make afterwards.
+The first two and the box are the robustness tests of the DEnKF paper's KITTI code, relative to the image size instead
+of in pixels of 1242 x 375. Images are ``[*B, C, H, W]``, uint8 in [0, 255] or floating in [0, 1], and keep their dtype;
+every frame has its own draws. Append a disturbance to an environment with images (after ``ToTensorImage``), or call it
+on data. Derived entries must be computed from disturbed frames: for a drive, disturb ``image``, from which
+:func:`torch_denkf.applications.car.kitti.frames.drive_frames` and :class:`torch_denkf.applications.car.KITTIReplayEnv`
+compute difference images afterwards.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class SaltAndPepper(ImageDisturbance):
         n, channels, height, width = frames.shape
         count = min(round(self.fraction * height * width), height * width // 2)
         noise = torch.rand(n, height * width, generator=self.generator, device=frames.device)
-        # Sorted by value: the order of the places is random, so the first half is a fair choice for the white ones.
+        # The largest random values select random pixels; the first half of them becomes white.
         place = noise.topk(2 * count, -1).indices.unsqueeze(1).expand(-1, channels, -1)
         value = torch.zeros(2 * count, dtype=frames.dtype, device=frames.device)
         value[:count] = scale_of(frames)
@@ -72,7 +72,7 @@ class SaltAndPepper(ImageDisturbance):
 
 
 class Blur(ImageDisturbance):
-    """Box blur: each pixel becomes the mean of the ``kernel`` around it, as far as the picture goes.
+    """Applies a box blur: each pixel becomes the mean of the ``kernel`` around it, without padding at the border.
 
     Args:
         kernel: side in pixels, odd, or (height, width); by default the odd number next to 15/1242 of the frame's width
@@ -112,7 +112,7 @@ class Blur(ImageDisturbance):
     def _disturb(self, frames: Tensor) -> Tensor:
         side = max(3, 2 * int(15 / 1242 * frames.shape[-1] / 2) + 1)
         height, width = (side, side) if self.kernel is None else self.kernel
-        # A box is the product of a column and a row, and so is the number of pixels of it inside the picture.
+        # The box is separable, and so is its number of pixels inside the image.
         values = _mean_filter(to_float(frames), (height, 1))
         return to_dtype(_mean_filter(values, (1, width)), frames)
 
@@ -123,11 +123,11 @@ def _mean_filter(values: Tensor, kernel: tuple[int, int]) -> Tensor:
 
 
 class Brightness(ImageDisturbance):
-    """Another exposure for each frame: ``gain * value + offset``, cut off at black and white.
+    """Draws an exposure for each frame: ``gain * value + offset``, clamped to black and white.
 
     Args:
         gain: bounds of the uniform factor.
-        offset: bounds of the uniform summand, as a share of white.
+        offset: bounds of the uniform offset, relative to white.
         p: probability that a frame is disturbed.
         in_keys: entries of the frame ``[*B, C, H, W]``.
         generator: source of randomness, on the images' device; torch's global one by default.
@@ -170,7 +170,7 @@ class Brightness(ImageDisturbance):
 
 
 class BlackFrames(ImageDisturbance):
-    """Makes whole frames black without a word: other than with ``MissingFrames``, no mask tells the filter.
+    """Makes whole frames black; unlike ``MissingFrames``, no mask tells the filter.
 
     Args:
         p: probability that a frame is black.
@@ -201,18 +201,17 @@ class BlackFrames(ImageDisturbance):
 
 
 class OccludingBox(ImageDisturbance):
-    """Hides a part of the picture behind a box.
+    """Occludes a part of the image by a box.
 
-    Append it to a replay, and a sensor learns what it looks like not to see; see
-    :class:`~torch_denkf.imperfect.Visibility`.
+    Append it to a replay to train a sensor's visibility estimate; see :class:`~torch_denkf.imperfect.Visibility`.
 
     Args:
         size: shares of the frame's height and width; by default 150 x 150 pixels of KITTI's 375 x 1242.
         position: the box's upper left corner as shares of the height and the width, by default row 100 and column 500
-            of 375 x 1242, as in the paper's code; what would stick out is cut off. ``None`` draws a place for each
-            frame, uniformly over those where the box is whole.
-        fill: what is seen in its place: ``"black"``; ``"blur"``, the mean of the picture about each pixel, a quarter of
-            its width wide; or ``"noise"``, pixels between black and white, each by itself.
+            of 375 x 1242, as in the paper's code; the box is clipped to the image. ``None`` draws a position for each
+            frame, uniformly among those with the box inside the image.
+        fill: content of the box: ``"black"``; ``"blur"``, a box blur of a quarter of the image's width; or ``"noise"``,
+            independent pixels between black and white.
         p: probability that a frame is disturbed.
         in_keys: entries of the frame ``[*B, C, H, W]``.
         generator: source of randomness, on the images' device; torch's global one by default.

@@ -1,4 +1,4 @@
-"""The last reading that arrived, for what cannot do without one."""
+"""Zero-order hold of missing readings, for networks that need a reading in each step."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ __all__ = ["HoldReading"]
 
 
 class HoldReading(Checked, Transform):
-    """Adds the last reading that arrived: what a network without a filter can read where readings are missing.
+    """Adds the last reading that arrived (zero-order hold), for networks without a filter.
 
-    A missing reading is NaN or zero. A filter leaves it out; an LSTM that reads NaN returns NaN from then on, without
-    an error. An episode begins with zeros where no reading has arrived yet. Nothing is kept on the transform: the held
-    reading is part of the observation spec and of the state spec, so workers and partial resets carry it, and stored
-    data hold it already.
+    A missing reading is NaN or zero. A filter skips it; an LSTM that reads NaN returns NaN from then on, without an
+    error. Before the first reading of an episode the held value is zero. The transform is stateless: the held reading
+    is part of the observation spec and of the state spec, so that workers, partial resets and stored data include it.
 
     Args:
         in_key: the reading ``[*B, ...]``.
-        observed_key: its mask, ``[*B, 1]``, or that of single components, ``[*B, O]``; True where it has arrived.
-        out_key: where to write the held reading, of the reading's shape.
+        observed_key: its mask, ``[*B, 1]``, or that of single components, ``[*B, O]``; True if it has arrived.
+        out_key: key of the held reading, of the reading's shape.
 
     Raises:
-        KeyError: if there is no reading or no mask, or if a step's tensordict lacks what was held.
+        KeyError: if there is no reading or no mask, or if a step's tensordict lacks the held reading.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -69,7 +68,7 @@ class HoldReading(Checked, Transform):
         return self._write(next_tensordict, before)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._write(tensordict_reset, None)  # the environment puts back what the other rows held
+        return self._write(tensordict_reset, None)  # the environment restores the other rows
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -81,10 +80,10 @@ class HoldReading(Checked, Transform):
         return out.set(self.out_keys[0], torch.where(expand_as_right(torch.stack(rows).any(0), now), now, before))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Does nothing to data that hold the reading already, as an environment's do.
+        """Returns data that have the held reading, as from an environment, unchanged.
 
         Raises:
-            KeyError: if they do not.
+            KeyError: if they lack it.
         """
         cure = "Append HoldReading to the environment, not to a replay buffer."
         self._entry(tensordict, self.out_keys[0], cure)
@@ -97,7 +96,7 @@ class HoldReading(Checked, Transform):
         return observation_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Adds it to the state, by which it reaches workers."""
+        """Adds it to the state spec, which passes it to workers."""
         if input_spec.get("full_state_spec", None) is None:
             input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
         held = self.parent.full_observation_spec[self.in_keys[0]]

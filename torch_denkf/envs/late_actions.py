@@ -1,4 +1,4 @@
-"""Actions that run some steps after they were chosen."""
+"""Delayed actions: the latency between choice and execution."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ __all__ = ["LateActions"]
 
 
 class LateActions(Checked, Transform):
-    """Lets each action run some steps after it was chosen, as sensing, inference and a bus do on a robot.
+    """Delays each action by some steps, like the latency of sensing, inference and a bus on a robot.
 
-    The actions under way are an entry ``[*B, K, A]``, ``("under_way", "action")``: the first runs now, the one that is
-    chosen now joins behind the last. An episode begins with zeros. Nothing is kept on the transform: the entry is part
-    of the observation spec and of the state spec. A filter's transform or policy behind it is driven by the action that
-    runs. Stored data hold the chosen ones: give a loss on them
-    ``data.set("action", data["under_way", "action"][..., 0, :])``.
+    The actions under way are an entry ``[*B, K, A]``, ``("under_way", "action")``: the first is executed now, the one
+    that is chosen now is appended after the last. An episode begins with zeros. The transform is stateless: the entry
+    is part of the observation spec and of the state spec. A filter's transform or policy after it is driven by the
+    executed action. Stored data have the chosen actions: for a loss, use ``data.set("action", data["under_way",
+    "action"][..., 0, :])``.
 
     Args:
-        steps: K, from the choice to the run.
-        action_key: of the action.
+        steps: K, latency in steps.
+        action_key: key of the action.
 
     Raises:
-        ValueError: if ``steps`` is no positive count.
+        ValueError: if ``steps`` is no positive number.
         KeyError: if a step's tensordict lacks the actions under way.
 
     Example:
@@ -85,7 +85,7 @@ class LateActions(Checked, Transform):
         return observation_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Adds them to the state, by which they reach workers."""
+        """Adds them to the state spec, which passes them to workers."""
         if input_spec.get("full_state_spec", None) is None:
             input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
         input_spec["full_state_spec"][self.out_keys[0]] = self._zeros()

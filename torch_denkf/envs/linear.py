@@ -1,4 +1,4 @@
-"""A linear-Gaussian system as an environment: the one on which every filter has a closed-form oracle."""
+"""Linear-Gaussian system as an environment, for which the Kalman filter is the exact solution."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def _constant(name: str, value: torch.Tensor | Sequence) -> torch.Tensor:
 class LinearGaussianEnv(Checked, SeededEnv):
     r"""Simulates :math:`x_{t+1} = F x_t + B a_t + N(0, Q)`, :math:`y_t = H x_t + N(0, R)`.
 
-    Emits ``"state"`` ``[*B, S]`` (the truth), ``"observation"`` ``[*B, O]`` and ``"observed"`` ``[*B, 1]``; readings
-    that are not observed are NaN. Takes an ``"action"`` ``[*B, A]``; without ``control`` it has no effect.
+    Observations are ``"state"`` ``[*B, S]`` (ground truth), ``"observation"`` ``[*B, O]`` and ``"observed"`` ``[*B,
+    1]``; missing readings are NaN. The ``"action"`` is ``[*B, A]``; without ``control`` it has no effect.
 
     Args:
         transition: F, ``[S, S]``.
@@ -43,7 +43,7 @@ class LinearGaussianEnv(Checked, SeededEnv):
         missing: probability that a reading is missing.
         max_steps: length of an episode, a number or one for each row of the batch.
         batch_size: ``*B``.
-        seed: of the environment's own generator.
+        seed: seed of the environment's generator.
 
     Example:
         >>> env = LinearGaussianEnv(torch.eye(2), torch.eye(2), [0.1, 0.1], [1.0, 1.0], batch_size=[3])
@@ -98,7 +98,7 @@ class LinearGaussianEnv(Checked, SeededEnv):
             "initial_std": torch.ones(state_dim) if initial_std is None else torch.as_tensor(initial_std, dtype=dtype),
             "max_steps": torch.as_tensor(max_steps).expand(self.batch_size),
         }
-        for name, value in constants.items():  # which move with the environment
+        for name, value in constants.items():  # buffers move with the environment
             self.register_buffer(name, value if device is None else value.to(device), persistent=False)
         self.missing = missing
         shape = self.batch_size

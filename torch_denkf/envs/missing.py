@@ -1,4 +1,4 @@
-"""Frames that do not arrive."""
+"""Missing frames."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["MissingFrames"]
 class MissingFrames(FrameTransform):
     """Drops each frame with probability ``p``: its entries become zero and ``observed`` becomes ``False``.
 
-    This is the paper's test with missing observations (section IV-A, p = 0.3). Frames that are missing already stay
-    so; the frame of a reset counts like any other. Black frames that nobody reports are
+    This is the paper's test with missing observations (section IV-A, p = 0.3). Frames that are already missing stay
+    missing; the frame of a reset may be dropped, too. For unannounced black frames see
     :class:`torch_denkf.envs.BlackFrames`.
 
     Args:
         p: probability that a frame is dropped.
         in_keys: entries of the frame ``[*B, ...]``.
-        observed_key: the mask ``[*B, 1]``; it is added where the environment has none.
+        observed_key: the mask ``[*B, 1]``; it is added if the environment has none.
         generator: source of randomness; torch's global one by default.
 
     Raises:
@@ -63,7 +63,7 @@ class MissingFrames(FrameTransform):
         return next_tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the mask where there is none."""
+        """Adds the mask if there is none."""
         if self.observed_key not in observation_spec.keys(True, True):
             shape = (*observation_spec.shape, 1)
             observation_spec[self.observed_key] = Binary(shape=shape, dtype=torch.bool, device=observation_spec.device)

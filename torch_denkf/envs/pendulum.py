@@ -1,4 +1,4 @@
-"""Gymnasium's Pendulum-v1, many at once, read by a noisy encoder."""
+"""Batched version of Gymnasium's Pendulum-v1 with a noisy encoder."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["NoisyPendulumEnv"]
 
 
 class NoisyPendulumEnv(LinearGaussianEnv):
-    r"""Gymnasium's Pendulum-v1, whose angle is read with noise, and whose velocity nobody reads.
+    r"""Gymnasium's Pendulum-v1 with noisy observations of the angle, and without observations of the velocity.
 
-    The motor is too weak to lift the pendulum at once. The angle :math:`\theta` is 0 where it stands upright:
+    The motor is too weak to lift the pendulum at once. The angle :math:`\theta` is 0 in the upright position:
 
     .. math::
         \dot\theta_{t+1} = \mathrm{clip}(\dot\theta_t + \Delta t (15 \sin \theta_t + 3 u_t), \pm 8), \quad
@@ -26,16 +26,16 @@ class NoisyPendulumEnv(LinearGaussianEnv):
     :math:`-(\theta^2 + 0.1 \dot\theta^2 + 0.001 u^2)` before the step. Episodes begin at any angle, with at most
     1 rad/s.
 
-    Emits ``"state"`` ``[*B, 3]`` (cosine, sine, velocity in rad/s), ``"observation"`` ``[*B, 2]`` (cosine and sine with
-    noise, NaN where missing) and ``"observed"`` ``[*B, 1]``, as :class:`LinearGaussianEnv` does. Takes an ``"action"``
-    ``[*B, 1]`` in Nm.
+    Observations are ``"state"`` ``[*B, 3]`` (cosine, sine, velocity in rad/s), ``"observation"`` ``[*B, 2]`` (cosine
+    and sine with noise, NaN where missing) and ``"observed"`` ``[*B, 1]``, as in :class:`LinearGaussianEnv`. The
+    ``"action"`` is ``[*B, 1]`` in Nm.
 
     Args:
         noise: standard deviation of the reading of the cosine, and of that of the sine.
         missing: probability that a reading is missing.
         max_steps: length of an episode.
         batch_size: ``*B``.
-        seed: of the environment's own generator.
+        seed: seed of the environment's generator.
 
     Reference:
         ``gymnasium/envs/classic_control/pendulum.py`` in Gymnasium 1.0.
@@ -58,7 +58,7 @@ class NoisyPendulumEnv(LinearGaussianEnv):
         seed: int = 0,
         device: torch.device | str | None = None,
     ):
-        # Readings, masks and the time limit are a linear system's; motion and reward are not.
+        # Readings, masks and the time limit are those of the linear system; motion and reward are overridden.
         one = torch.eye(3)
         super().__init__(
             one,

@@ -1,4 +1,4 @@
-"""Replays any data set as an environment: what a robot in its episodes would have seen, row by row."""
+"""Replays a data set as an environment, row by row."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NOT_SHOWN = ("next", "done", "terminated", "truncated", "is_init", "action", "i
 
 
 class RecordedPolicy(TensorDictModuleBase):
-    """Commands what was commanded in the recording: copies ``("recorded", "action")`` to ``"action"``.
+    """Repeats the recorded commands: copies ``("recorded", "action")`` to ``"action"``.
 
     Examples:
         >>> now = TensorDict({"recorded": TensorDict({"action": torch.ones(3, 2)}, [3])}, [3])
@@ -41,42 +41,41 @@ class RecordedPolicy(TensorDictModuleBase):
 class ReplayEnv(RowsEnv):
     """Replays the episodes of a data set, one in each element of the batch, in lockstep.
 
-    Emits, at reset and at each step, a row exactly as ``data[row]`` has it: its readings, ``state``, ``observed``,
-    ``step``, ``time``, ``episode`` and what the data set's transform adds. ``is_init`` is True at reset; ``truncated``
-    and ``done`` are True in the last row. Elements may end at different steps; a reset restarts only those that
-    ``"_reset"`` marks. Rewards are zero.
+    At reset and at each step it returns a row ``data[row]``: readings, ``state``, ``observed``, ``step``, ``time``,
+    ``episode`` and entries of the data set's transform. ``is_init`` is True at reset; ``truncated`` and ``done`` are
+    True in the last row. Elements may end at different steps; a reset restarts only those that ``"_reset"`` marks.
+    Rewards are zero.
 
-    Elements take the episodes in turn: with a batch of three, the first reset shows the first three, and each element
-    that ends goes on with the next one that none has had. ``set_seed`` restarts this turn and the random starts.
-    Each worker of a SerialEnv or ParallelEnv has a turn of its own: give each its ``episodes``.
+    Elements take the episodes in order: with a batch of three, the first reset selects the first three, and each
+    element that ends continues with the next unused one. ``set_seed`` restarts this order and the random starts. Each
+    worker of a SerialEnv or ParallelEnv has its own order: pass each its ``episodes``.
 
-    **Actions.** A replay goes on as it was recorded, whatever is commanded.
+    **Actions.** A replay does not depend on the actions.
 
-    Where the data set has an ``action``, the environment's has its shape. The recorded one is emitted as
-    ``("recorded", "action")``: that which was sent in this row and led to the next. ``env.rollout(n)`` without policy
-    replays it (``rand_action`` does), and so does the policy ``env.policy``, a :class:`RecordedPolicy`, which
-    SerialEnv, ParallelEnv and collectors need: ``env.rollout(n, RecordedPolicy())``. A filter in a
-    :class:`~torch_denkf.transforms.DEnKFTransform` reads the ``action`` that the policy wrote, so with this policy it
-    is driven by the recorded commands. With another policy it predicts motions that never happened.
+    If the data set has an ``action``, the environment's has its shape. The recorded action, which was sent in this row
+    and led to the next, is in ``("recorded", "action")``. ``env.rollout(n)`` without policy replays it (``rand_action``
+    does), and so does the policy ``env.policy``, a :class:`RecordedPolicy`, which SerialEnv, ParallelEnv and collectors
+    need: ``env.rollout(n, RecordedPolicy())``. A filter in a :class:`~torch_denkf.transforms.DEnKFTransform` reads the
+    policy's ``action``, so that with this policy it is driven by the recorded commands.
 
-    Where nothing was commanded, the action has **width zero**, see
-    :class:`~torch_denkf.applications.car.KITTIReplayEnv`.
+    With another policy it predicts motions that never happened. Without recorded actions, the action has **width
+    zero**, see :class:`~torch_denkf.applications.car.KITTIReplayEnv`.
 
     Args:
         data: a data set, such as :class:`~torch_denkf.data.RecordingReplay`.
         batch_size: ``*B``.
-        episodes: which to replay, in this order: numbers in ``data.episodes``, or their names; by default all.
+        episodes: episodes to replay, in this order: numbers in ``data.episodes``, or their names; by default all.
         start: row of its episode at which a replay starts, or ``"random"``: each reset draws an episode and a start,
-            uniformly over all stretches of ``length`` rows.
-        length: rows of a replay, the one at reset included, at least 2; by default up to the episode's end.
-        seed: of the random starts; by default drawn from torch's generator.
-        device: of all that is emitted; by default that of the data.
+            uniformly among all windows of ``length`` rows.
+        length: rows of a replay, including the one at reset, at least 2; by default up to the episode's end.
+        seed: seed of the random starts; by default drawn from torch's generator.
+        device: device of the outputs; by default that of the data.
 
     Raises:
         TypeError: if ``data`` is no data set of episodes.
-        KeyError: for a name that no episode has.
-        ValueError: if an episode is shorter than the replay, random starts come without ``length``, or the data set
-            offers single rows.
+        KeyError: for an unknown name.
+        ValueError: if an episode is shorter than the replay, random starts are used without ``length``, or the data set
+            has single rows.
 
     Examples:
         >>> from torch_denkf.data import Episode, EpisodeReplay
@@ -116,7 +115,7 @@ class ReplayEnv(RowsEnv):
 
     @property
     def policy(self) -> RecordedPolicy | None:
-        """Replays the recorded commands; None where nothing was commanded."""
+        """Returns the policy of the recorded commands; None without recorded actions."""
         return RecordedPolicy() if self._recorded else None
 
     def _set_stretches(self, numbers: list[int], start: int | str, length: int | None) -> None:
@@ -141,7 +140,7 @@ class ReplayEnv(RowsEnv):
         ends = starts + torch.tensor([episode.length for episode in chosen], device=where) - 1
         self._starts = starts + begin
         self._ends = ends if length is None else self._starts + length - 1
-        self._stretches = (ends - self._ends + 1).cumsum(0)  # where random starts may be, one episode behind the other
+        self._stretches = (ends - self._ends + 1).cumsum(0)  # cumulative number of possible random starts
 
     def _choose(self, starts: Tensor) -> tuple[Tensor, Tensor]:
         if self._random:
@@ -168,7 +167,7 @@ class ReplayEnv(RowsEnv):
         return out.set(_RECORDED, shown["action"]) if self._recorded else out
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Writes the recorded action, where there is one."""
+        """Writes the recorded action, if there is one, else a random one."""
         if not self._recorded:
             return super().rand_action(tensordict)
         if tensordict is None:
@@ -178,7 +177,7 @@ class ReplayEnv(RowsEnv):
 
 
 def _numbers(data: EpisodeReplay, episodes: Sequence[int | str] | int | str | None) -> list[int]:
-    """Numbers of episodes by number or name."""
+    """Returns numbers of episodes by number or name."""
     if episodes is None:
         return list(range(len(data.episodes)))
     numbers = {episode.name: number for number, episode in enumerate(data.episodes)}

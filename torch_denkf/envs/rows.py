@@ -1,4 +1,4 @@
-"""Base of replays of recordings: rows that are shown one after the other, from a first to a last."""
+"""Base class of replays of recordings: returns rows in sequence, from a first to a last one."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _FLAGS = ("is_init", "done", "terminated", "truncated")
 
 
 class RowsEnv(Checked, EnvBase):
-    """Shows rows of a recording in lockstep, each element of the batch its own stretch of them.
+    """Replays rows of a recording in lockstep, a separate window in each element of the batch.
 
-    A stretch is truncated in its last row; a reset starts new stretches where ``"_reset"`` marks it. Rewards are zero.
-
-    A subclass writes :meth:`_rows_at` and :meth:`_choose`, and calls :meth:`_set_specs` at the end of its constructor.
+    A window is truncated in its last row; ``"_reset"`` marks elements to start a new window. Rewards are zero. A
+    subclass implements :meth:`_rows_at` and :meth:`_choose`, and calls :meth:`_set_specs` at the end of its
+    constructor.
 
     Args:
         batch_size: ``*B``.
-        seed: of what is drawn; by default drawn from torch's generator.
-        device: of all that is emitted.
+        seed: seed of random draws; by default drawn from torch's generator.
+        device: device of the outputs.
     """
 
     def __init__(self, batch_size: Sequence[int], seed: int | None, device: torch.device | str | None):
@@ -43,16 +43,16 @@ class RowsEnv(Checked, EnvBase):
         raise NotImplementedError
 
     def _choose(self, starts: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns first and last rows ``[*B]`` of new stretches, for the elements that start one, ``[*B]`` bool."""
+        """Returns first and last rows ``[*B]`` of new windows, for the elements that start one, ``[*B]`` bool."""
         raise NotImplementedError
 
     def _set_specs(self, row: Tensor, actions: int = 0, **specs: TensorSpec) -> None:
-        """Specs by what some rows show.
+        """Derives specs from some rows.
 
         Args:
             row: ``[*B]``, any.
             actions: width of the action.
-            **specs: of keys whose values have bounds.
+            **specs: specs of keys with bounded values.
         """
         shape, shown = self.batch_size, self._rows_at(row)
         self._first = self._now = self._last = row.clone()
@@ -72,7 +72,7 @@ class RowsEnv(Checked, EnvBase):
         self.rng.manual_seed(0 if seed is None else seed)
 
     def _draw(self, counts: Tensor) -> Tensor:
-        """Numbers ``[*B]``, each uniform in 0 to ``counts - 1``."""
+        """Returns integers ``[*B]``, each uniform in 0 to ``counts - 1``."""
         draw = torch.rand(self.batch_size, generator=self.rng, dtype=torch.float64).to(counts.device)
         return (draw * counts).long().minimum(counts - 1)
 

@@ -1,4 +1,4 @@
-r"""One base for all filters: a step on a tensordict, or a whole sequence with resets.
+r"""Base class of all filters: runs a step on a tensordict, or a whole sequence with resets.
 
 The order in time is predict, then update::
 
@@ -41,7 +41,7 @@ from torch_denkf.submodel import Call, Entries, Initial, Transition, flat_noise,
 
 __all__ = ["Filter"]
 
-#: Sees each run of a filter before anything is written; it may warn, count, or raise.
+#: Called with each run of a filter before anything is written; it may warn, count, or raise.
 Observer = Callable[["Filter", Record], None]
 
 
@@ -49,48 +49,49 @@ class Filter(Checked, TensorDictSequential):
     """A Bayesian filter: TensorDict modules in sequence, and an initial belief.
 
     The modules are sorted once, by their keys: those that depend on the belief (transition, observation, analysis) are
-    the step; the others (sensor, noise) read frames alone and, on a sequence, run once on all of them. The entries that
+    the step; the others (sensor, noise) read only frames and, on a sequence, run once on all of them. The entries that
     the step reads before it writes them, and that ``initial`` provides, are the *carry*: ``("belief", "ensemble")`` for
     an ensemble, ``("belief", "mean")`` and ``("belief", "cov")`` for a Kalman filter.
 
     There are three ways to run it:
 
-    * :meth:`step` in a loop: the carry in the tensordict is the belief at t-1, the frame that of t; afterwards the
-      belief is that of t.
-    * :meth:`sequence` on ``[*B, T]``, time last. Where an episode or a slice begins (``is_init``, or after a ``done``)
-      the belief is the one that is stored there, which has seen that frame already, and the initial belief where none
-      is stored. All other beliefs are one step on from their predecessor. Actions are read one step earlier, as torchrl
+    * :meth:`step` in a loop: the tensordict has the belief at t-1 (the carry) and the frame of t; the step replaces
+      that belief by the belief at t.
+    * :meth:`sequence` on ``[*B, T]``, time last. At the first element of an episode or a slice (``is_init``, or after a
+      ``done``) the belief is the stored one, which has seen that frame already, or the initial belief if none is
+      stored. Each later belief is one step on from its predecessor. Actions are read one step earlier, as torchrl
       stores them.
-    * in a policy, behind :meth:`make_tensordict_primer`, like :class:`torchrl.modules.LSTMModule`: the belief at t-1
-      comes under ``("previous", ...)``, that of t goes to ``("belief", ...)`` for the actor, and to
-      ``("next", "previous", ...)`` for the next step. torchrl's losses, which turn its recurrent mode on, then filter
-      the stored sequences, and leave ``("next", "previous", ...)`` as it was stored; each begins with a step from the
-      belief that is stored under ``("previous", ...)``.
+    * in a policy, with :meth:`make_tensordict_primer`, like :class:`torchrl.modules.LSTMModule`: the belief at t-1 is
+      read from ``("previous", ...)``, that of t is written to ``("belief", ...)`` for the actor, and to
+      ``("next", "previous", ...)`` for the next step. In torchrl's recurrent mode, which its losses turn on, the filter
+      runs over the stored sequences. Each begins with a step from the belief stored under ``("previous", ...)``, and
+      ``("next", "previous", ...)`` is not overwritten.
 
     Args:
         modules: TensorDict modules in order, or one dict of them by name. The name (or number) of a module is its
-            place; its noise is read from, and drawn to, ``("noise", place)``.
+            place; its noise is read from and written to ``("noise", place)``.
         initial: the initial belief, see :mod:`torch_denkf.modules.belief`.
-        control_keys: entries that drive the transition *out of* the time they are stored at, by default the action.
+        control_keys: entries that drive the transition *out of* the time at which they are stored, by default the
+            action.
         init_key: marks the first element of an episode, ``[*B, 1]`` bool, as written by
-            :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; one of its name in a group of agents
-            counts, too.
+            :class:`torchrl.envs.InitTracker` and torchrl's ``SliceSampler``; an entry of the same name in a group of
+            agents marks it, too.
         update_at_reset: whether the initial belief is updated with the first frame.
-        forecast_keys: the forecast of each carried entry, where its name does not tell.
-        variance_ceiling: the belief's variances are clamped to it, so that an unstable system that nobody observes
-            stays finite, with one warning; in the state's units squared. ``None`` for no ceiling.
-        check_finite: whether a step raises where its new belief is not finite, and any run where the noise of a reading
-            is no covariance. In a sequence the NaN of a belief that diverges goes on to its end, and one warning names
-            its cause. Readings are checked, or rejected, by ``torch_denkf.imperfect.RejectReadings`` in front of the
-            filter. On a GPU nothing is looked at: each step would wait for it.
+        forecast_keys: the forecast of each carried entry, if the names are ambiguous.
+        variance_ceiling: upper bound of the belief's variances, in the state's units squared, which keeps an unstable
+            and unobserved system finite; the first clamped variance warns. ``None`` for no ceiling.
+        check_finite: whether a step raises if its new belief is not finite, and any run if the noise of a reading
+            is no covariance. In a sequence a belief that diverges stays NaN to the end, and one warning names the
+            cause. Readings are checked, or rejected, by ``torch_denkf.imperfect.RejectReadings`` in front of the
+            filter. A GPU skips these checks, for which each step would have to wait.
         keep_noise: whether a step in a policy writes the noise that it drew, under ``("drawn", place)``. Recurrent mode
-            then filters the collected data with the same draws, so that a policy's probabilities are those with which
-            it was collected as long as nothing has been learned.
-        prefix: name under which all stands that the filter writes, carries on or finds as noise: with ``"imu"`` the
+            then filters the collected data with the same draws, so that the policy's probabilities equal those at
+            collection until its parameters change.
+        prefix: first name of the keys of all outputs, carried entries and noise of the filter: with ``"imu"`` the
             mean is ``("imu", "belief", "mean")``. Two filters of one environment or policy need one. ``None`` for none.
 
     Raises:
-        ValueError: if no module depends on what ``initial`` provides, or one module overwrites what another wrote
+        ValueError: if no module depends on the outputs of ``initial``, or one module overwrites the output of another
             before it is read; or if ``prefix`` is ``"next"``.
         TypeError: if parameters or constants differ in precision.
 
@@ -105,8 +106,8 @@ class Filter(Checked, TensorDictSequential):
         >>> kf.sequence(drives)["belief", "mean"].shape
         torch.Size([4, 10, 1])
 
-        torch's hooks look into each step, also of a sequence, in an environment or a policy. A compiled filter calls no
-        hook that is registered later; ``filter.compile(chunk=0)`` makes it eager again:
+        torch's forward hooks run in each step, also of a sequence, in an environment or a policy. A compiled filter
+        skips hooks that are registered after compilation; ``filter.compile(chunk=0)`` makes it eager again:
 
         >>> innovations = []
         >>> look = lambda module, read, out: innovations.append(out["info", "innovation"])
@@ -150,13 +151,13 @@ class Filter(Checked, TensorDictSequential):
 
     def _set_options(self, control_keys, init_key, forecast_keys, check_finite, keep_noise, **fixed: Any) -> None:
         if fixed["prefix"] == "next":
-            raise ValueError('prefix="next" is where torchrl keeps the next step: give the filter another name')
+            raise ValueError('prefix="next" is reserved by torchrl for the next step: give the filter another prefix')
         self.init_key, self.control_keys = unravel_key(init_key), list(control_keys)
         self.forecast_keys, self.check_finite, self.keep_noise = dict(forecast_keys or {}), check_finite, keep_noise
         self.fixed_options = fixed
 
     def _sort(self) -> None:
-        """Sorts the modules, and looks up once what each run reads and writes."""
+        """Sorts the modules, and caches the keys that each run reads and writes."""
         modules = named_modules_of(self)
         controls = [unravel_key(key) for key in self.control_keys]
         structure = Structure.of(modules, self.initial, controls, self.forecast_keys)
@@ -188,14 +189,14 @@ class Filter(Checked, TensorDictSequential):
 
     @property
     def prefix(self) -> str | None:
-        """Returns the name under which the filter's own entries stand."""
+        """Returns the prefix of the filter's own keys."""
         return self.fixed_options["prefix"]
 
     def with_options(self, **options: Unpack[FilterOptions]) -> Filter:
         """Returns a filter of the same modules with other options, see the class.
 
         Raises:
-            TypeError: if there is no such option, or it is of another kind.
+            TypeError: if there is no such option, or it has the wrong type.
             ValueError: if an option is out of range.
 
         Example:
@@ -217,13 +218,13 @@ class Filter(Checked, TensorDictSequential):
     def with_modules(
         self, modules: Mapping[str, TensorDictModuleBase] | None = None, /, **others: TensorDictModuleBase
     ) -> Filter:
-        """Returns a filter with other modules in some places; all else is shared with this one.
+        """Returns a filter with other modules in some places; all other modules are shared with this one.
 
-        Keys, spaces and inflation are those of the new modules: give them what the old ones had.
+        Keys, spaces and inflation are those of the new modules, and are not copied from the old ones.
 
         Args:
-            modules: new modules by name or number of their place; of one inside a sequence both names, ``"second.1"``;
-                ``"initial"`` for the initial belief.
+            modules: new modules by name or number of their place; a place inside a sequence is ``"second.1"``, the
+                initial belief ``"initial"``.
             **others: the same, by name.
 
         Raises:
@@ -260,12 +261,12 @@ class Filter(Checked, TensorDictSequential):
 
     @property
     def carry_keys(self) -> list[NestedKey]:
-        """Returns the entries of the belief that go on from step to step."""
+        """Returns the keys of the belief that are carried from step to step."""
         return [self.outer(key) for key in self.structure.carry]
 
     @property
     def belief_keys(self) -> list[NestedKey]:
-        """Returns all entries of the belief: the carry, and what follows from it."""
+        """Returns the keys of the belief: the carry, and entries computed from it, such as mean and variance."""
         return [self.outer(key) for key in self.structure.belief]
 
     @property
@@ -274,7 +275,7 @@ class Filter(Checked, TensorDictSequential):
         return self.structure.transition[1]
 
     def outer(self, key: NestedKey) -> NestedKey:
-        """Returns the key of an entry outside of the filter: what the filter writes stands under the prefix."""
+        """Returns the key of an entry outside of the filter, with the prefix if the filter writes the entry."""
         if self.prefix is None:
             return key
         names = (key,) if isinstance(key, str) else key
@@ -284,17 +285,17 @@ class Filter(Checked, TensorDictSequential):
         return (self.prefix, *names) if own else key
 
     def inside(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns a shallow copy that holds the filter's own entries as they would be without a prefix."""
+        """Returns a shallow copy in which the filter's own entries have no prefix."""
         out = tensordict.copy()
         return out if self.prefix is None else out.update(tensordict.get(self.prefix))
 
     def __setitem__(self, index, module) -> None:
-        """Raises: :meth:`with_modules` makes a filter with another module.
+        """Raises ``TypeError``: :meth:`with_modules` returns a filter with another module.
 
         Raises:
             TypeError: always.
         """
-        raise TypeError(f"A filter with another module is a new one: filter.with_modules({{{index!r}: module}})")
+        raise TypeError(f"Filters keep their modules; make a new filter: filter.with_modules({{{index!r}: module}})")
 
     def __getitem__(self, index):
         """Returns one module, by number or name, or a plain ``TensorDictSequential`` of several."""
@@ -304,14 +305,14 @@ class Filter(Checked, TensorDictSequential):
         return TensorDictSequential(*modules) if isinstance(index, slice) else modules
 
     def select_subsequence(self, in_keys=None, out_keys=None) -> TensorDictSequential:
-        """Returns the modules between some keys; a part of a filter is a plain ``TensorDictSequential``."""
+        """Returns the modules between some keys as a plain ``TensorDictSequential``."""
         return self[:].select_subsequence(in_keys, out_keys)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Returns the transform that carries the belief where the filter is part of the policy.
+        """Returns the transform that carries the belief of a filter inside a policy.
 
-        Like :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`; where actions drive the filter, it also brings
-        the last action (:class:`torch_denkf.transforms.LastAction`).
+        It is the counterpart of :meth:`torchrl.modules.LSTMModule.make_tensordict_primer`. If actions drive the filter,
+        it also carries the last action (:class:`torch_denkf.transforms.LastAction`).
         """
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             belief = run_module(self.initial, self.draws.nothing(()), Call(torch.Size(), "initial"))
@@ -327,38 +328,38 @@ class Filter(Checked, TensorDictSequential):
     def compile(self, *, chunk: int | None = None, **options) -> Filter:
         """Runs steps, and sequences in chunks of steps, through ``torch.compile`` from now on.
 
-        The first call of each kind (batch size, with or without gradients) compiles, later ones reuse that;
-        copies and pickles of the filter compile again. Noise is drawn outside: a seed gives what it gives eagerly, up
-        to rounding. Some calls stay eager: :meth:`predict`; ``step(without=...)``; in a policy, steps in which rows may
+        The first call of each kind (batch size, with or without gradients) compiles, later calls reuse the result;
+        copies and pickles of the filter compile again. Noise is drawn outside: a seed gives the eager result, up to
+        rounding. Some calls stay eager: :meth:`predict`; ``step(without=...)``; in a policy, steps in which rows may
         reset.
 
-        Compilers have errors that nothing else shows. So the first call also runs eagerly, and where a reading is zero
-        or missing both run again with numbers in it; a sequence with gradients is differentiated both ways, too. What
-        differs by more than rounding raises.
+        The first call also runs eagerly, to detect compiler errors, and raises if the results differ by more than
+        rounding. If a reading is zero or missing, the comparison is repeated with random numbers in it. For a sequence
+        with gradients, the gradients are compared, too.
 
-        On a GPU an eager step waits for its launches. ``mode="graph"`` compiles nothing: it records what the eager
-        steps launch, and their backward pass, in CUDA graphs, in about the time of a few eager calls. There a number
-        that is no tensor, such as an inflation, stays the one of the recording; on a processor it warns, and runs
-        eagerly. With further options, such as ``backend="inductor"``, one step is compiled, and the graphs hold that.
+        On a GPU an eager step is limited by kernel launches. ``mode="graph"`` compiles nothing: it records the kernels
+        of the eager steps, and of their backward pass, in CUDA graphs, in about the time of a few eager calls. Python
+        numbers, such as an inflation, are constants of the recording. On a processor this mode warns, and runs
+        eagerly. With further options, such as ``backend="inductor"``, the graphs record a compiled step.
 
-        ``mode="in time"`` compiles nothing: a :class:`~torch_denkf.filters.KalmanFilter` then takes all times of a
-        sequence at once, in the order of log2 T calls. From some hundred rows on that is 25 to 50 times faster.
+        ``mode="in time"`` compiles nothing: a :class:`~torch_denkf.filters.KalmanFilter` then processes all times of a
+        sequence in parallel, in the order of log2 T calls. From some hundred rows on that is 25 to 50 times faster.
 
         Args:
             chunk: steps of a sequence in one compiled graph, 4 by default; one graph serves sequences of any length. A
                 small chunk compiles sooner, a large one runs faster. 0 goes back to eager. With ``mode="graph"`` by
                 default all steps are in one.
-            **options: of ``torch.compile``. Without any, inductor on a processor writes what calls its kernels in C++,
-                too, makes fewer calls, and saves fewer tensors for the backward pass, which takes longer to compile and
-                about 40 % less to run; ``backend="inductor"`` alone leaves that out. On a GPU
-                ``mode="reduce-overhead"`` asks for CUDA graphs.
+            **options: of ``torch.compile``. Without any, inductor on a processor also generates the calling code in
+                C++, makes fewer calls, and saves fewer tensors for the backward pass: compilation takes longer, a run
+                about 40 % less. ``backend="inductor"`` alone turns this off. On a GPU ``mode="reduce-overhead"`` uses
+                CUDA graphs.
 
         Returns:
             This filter.
 
         Raises:
-            RuntimeError: if there is no C++ compiler, which processors need. In a later call, if what was compiled is
-                wrong.
+            RuntimeError: if there is no C++ compiler, which processors need; in the first call, if the compiled result
+                differs from the eager one.
             ValueError: if ``chunk`` is negative.
         """
         self.compiled = None if chunk == 0 else compiler().strategy(chunk, options)
@@ -379,7 +380,7 @@ class Filter(Checked, TensorDictSequential):
                 entries[key] = entries[previous_key(key)]
         if not structure.must.issubset(entries):
             diagnosis().check_inputs(structure, type(self).__name__, entries, tensordict)
-        # A mark may be that of a slice of data, which goes on from the belief before it.
+        # is_init may mark a slice of data, which continues from the belief before it.
         known = entries.get(HAS_PREVIOUS)
         reset = starts_of(tensordict, self.init_key, step=True) if known is None else ~known.reshape(*size, 1)
         drawn: Entries = {}
@@ -392,7 +393,7 @@ class Filter(Checked, TensorDictSequential):
             call = Call(size)
             written = self.steps.step(entries, call, reset=reset, start=lambda now: self.initial_belief(now, call))
             self.steps.blank(written, reset)
-            # What went before does not count where an episode begins.
+            # A reset row has no previous belief.
             entries.update({key: where_rows(reset, written[key], entries[key]) for key in structure.carry})
         following = {("next", *previous_key(key)): written[key] for key in structure.carry}
         following["next", *HAS_PREVIOUS] = written[structure.carry[0]].new_ones(*size, 1, dtype=torch.bool)
@@ -406,19 +407,19 @@ class Filter(Checked, TensorDictSequential):
         """Predicts, then updates, on ``[*B]``: the carry in ``tensordict`` is the belief at t-1.
 
         Args:
-            tensordict: carry, frame, and what else the modules read; the new belief is written there. A dictionary of
-                numbers, arrays or tensors is one robot's, ``[]``, in the filter's precision; a number is an entry
-                ``[1]``.
-            without: keys of readings that are missing on purpose, or are of an earlier step: what reads them is left
-                out, and the belief is the forecast unless another sensor has something to say. Such a step runs
-                eagerly, also of a compiled filter.
+            tensordict: carry, frame, and other inputs of the modules; the new belief is written there. A dictionary of
+                numbers, arrays or tensors stands for one robot, batch size ``[]``, in the filter's precision; a number
+                becomes an entry ``[1]``.
+            without: keys of readings that are missing in this step, or are of an earlier step: their updates are
+                skipped, and without any update the belief is the forecast. Such a step runs eagerly, also of a
+                compiled filter.
 
         Returns:
             ``tensordict`` (of a dictionary, a new one), with the belief of t.
 
         Raises:
-            KeyError: if an entry is missing, or ``without`` names what no module reads.
-            ValueError: with ``check_finite``, if the new belief is not finite; or if readings are looked at together,
+            KeyError: if an entry is missing, or a key in ``without`` is read by no module.
+            ValueError: with ``check_finite``, if the new belief is not finite; or if one update uses several readings,
                 and ``without`` names some of them, not all.
         """
         if not isinstance(tensordict, TensorDictBase):
@@ -437,10 +438,10 @@ class Filter(Checked, TensorDictSequential):
         return self.write(tensordict, self.finished(Record("step", tensordict, size, entries, written)))
 
     def predict(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """Runs a step without any frame: the belief of t is the forecast. Takes and returns what :meth:`step` does.
+        """Runs a step without any frame: the belief of t is the forecast. Arguments and result are as in :meth:`step`.
 
         Raises:
-            KeyError: if an analysis does not say which entries are its readings.
+            KeyError: if an analysis does not declare which entries are its readings.
         """
         diagnosis().check_named_readings(self.structure)
         tensordict = self.of_one_robot(tensordict)
@@ -452,17 +453,17 @@ class Filter(Checked, TensorDictSequential):
         return tensordict.update(out.select(*written))
 
     def take_step(self, entries: Entries, batch_size: torch.Size) -> Entries:
-        """Returns what one step writes where ``entries`` are, unchecked, in the filter's way to run steps."""
+        """Runs one step on unchecked ``entries``, eagerly or compiled, and returns its outputs."""
         strategy = self.steps if self.compiled is None else self.compiled.of(self)
         return strategy.step(entries, Call(batch_size))
 
     def finished(self, record: Record, given: Iterable[Tensor] | None = None, *, check: bool | None = None) -> Entries:
-        """Ends every way to run: checks the new belief, clones what is not the filter's own, tells the observers.
+        """Ends every run: checks the new belief, clones outputs that share the caller's memory, calls the observers.
 
         Args:
-            record: what was read and written.
-            given: tensors that the caller keeps; those that were read by default.
-            check: whether a belief that is not finite raises; by default as the filter was made, but for a sequence.
+            record: inputs and outputs of the run.
+            given: tensors that the caller keeps; the inputs by default.
+            check: whether a belief that is not finite raises; by default ``check_finite``, and not in a sequence.
 
         Returns:
             The entries to write.
@@ -479,7 +480,7 @@ class Filter(Checked, TensorDictSequential):
         return record.written
 
     def observe(self, record: Record) -> None:
-        """Tells the observers; those that name no ``ways`` are told of steps and sequences, and not of data alone."""
+        """Calls the observers of this kind of run; an observer without ``ways`` is called for all in ``RUNS``."""
         for observe in self.observers:
             if record.way in getattr(observe, "ways", RUNS):
                 observe(self, record)
@@ -490,12 +491,12 @@ class Filter(Checked, TensorDictSequential):
         """Writes the belief at the start of an episode, for every row of ``tensordict`` ``[*B]``.
 
         Args:
-            tensordict: what the initial belief reads, see :mod:`torch_denkf.modules.belief`.
-            without: keys of readings that have not come yet. :class:`~torch_denkf.modules.FromSensor` then starts from
-                its prior.
+            tensordict: inputs of the initial belief, see :mod:`torch_denkf.modules.belief`.
+            without: keys of readings that have not arrived yet. :class:`~torch_denkf.modules.FromSensor` then starts
+                from its prior.
 
         Raises:
-            KeyError: if an entry is missing, or ``without`` names what no module reads.
+            KeyError: if an entry is missing, or a key in ``without`` is read by no module.
         """
         tensordict, structure, steps = self.of_one_robot(tensordict), self.structure, self.steps
         entries, call = self.entries_of(tensordict), Call(tensordict.batch_size)
@@ -517,16 +518,16 @@ class Filter(Checked, TensorDictSequential):
         return self.write(tensordict, own(written, given))
 
     def summarise(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the other entries of the belief, e.g. mean and variance, from its carry."""
+        """Writes the entries of the belief that are computed from its carry, e.g. mean and variance."""
         stored = {key: tensordict.get(self.outer(key), None) for key in self.structure.belief}
         stored = {key: value for key, value in stored.items() if value is not None}
         carry = {key: tensordict.get(self.outer(key)) for key in self.structure.carry}
         return self.write(tensordict, own(self.structure.completed(carry, stored)))
 
     def draw_noise(self, tensordict: TensorDictBase, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Writes the noise that the modules will need on ``tensordict`` (one step or a sequence), drawn in bulk.
+        """Writes the noise of all modules for ``tensordict`` (one step or a sequence), drawn in bulk.
 
-        Noise that is there already is kept.
+        Noise that is already in the tensordict is kept.
         """
         size, entries = tensordict.batch_size, self.entries_of(tensordict)
         places, time = (*dict(self.structure.modules), "initial"), len(size) > 0
@@ -536,21 +537,21 @@ class Filter(Checked, TensorDictSequential):
     def sequence(
         self, tensordict: TensorDictBase, *, detach_every: int | None = None, keep: Sequence[NestedKey] | None = None
     ) -> TensorDictBase:
-        """Filters a sequence ``[*B, T]`` and writes what a step writes, for every time.
+        """Filters a sequence ``[*B, T]`` and writes the outputs of a step for every time.
 
-        Slices of one length in a flat ``[N]``, as torchrl's ``SliceSampler`` returns them, are filtered side by side
-        where their beginnings are marked.
+        Slices of one length in a flat ``[N]``, as torchrl's ``SliceSampler`` returns them, are filtered in parallel if
+        ``is_init`` marks their beginnings.
 
         Args:
             tensordict: frames, and optionally ``is_init``, actions, masks, noise, and stored beliefs (see the class).
-            detach_every: truncates back-propagation through time: the belief is detached every so many steps.
+            detach_every: number of steps after which the belief is detached (truncated back-propagation through time).
             keep: the outputs to write; all by default. Ensembles of long sequences are large.
 
         Returns:
             ``tensordict``, with the outputs.
 
         Raises:
-            ValueError: if there is no time dimension, no step, or ``keep`` names what the filter does not write.
+            ValueError: if there is no time dimension, no step, or the filter does not write a key in ``keep``.
             KeyError: if an entry is missing.
         """
         if detach_every is not None:
@@ -581,13 +582,13 @@ class Filter(Checked, TensorDictSequential):
         given = list(entries.values())
         if structure.must - entries.keys() - {*structure.carry}:
             diagnosis().check_inputs(structure, type(self).__name__, entries, rows, carry=False)
-        with set_recurrent_mode(True):  # for modules that are not this package's
+        with set_recurrent_mode(True):  # for recurrent modules of torchrl and of users
             frames = steps.run(structure.frames, entries, call)
         gathered = gather_rows(structure, entries, marks, size, self.initial_belief)
         later = [place for place, _ in (structure.transition, *structure.update)]
         gathered.inputs.update(self.draws.missing({**entries, **gathered.starts}, size, places=later, time=True))
         cuts = [detach_every is not None and t > 0 and t % detach_every == 0 for t in range(size[-1])]
-        if gathered.stored:  # these have seen their frame
+        if gathered.stored:  # stored beliefs have seen their frame
             steps = steps._replace(update_at_reset=False)
         strategy = steps if self.compiled is None else self.compiled.of(self, steps)
         with set_recurrent_mode(False):
@@ -599,7 +600,7 @@ class Filter(Checked, TensorDictSequential):
         return self.finished(Record("sequence", tensordict, size, entries, outputs), given), rows
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns ``False`` for elements that hold an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
+        """Returns ``False`` for elements with an initial or stored belief, ``[*B, T]``; see :meth:`sequence`."""
         size = tensordict.batch_size
         marks = starts_of(tensordict, self.init_key)
         first = torch.zeros(size, dtype=torch.bool, device=device_of(tensordict))
@@ -607,18 +608,18 @@ class Filter(Checked, TensorDictSequential):
         first = first if marks is None else first | marks.reshape(size)
         if any(tensordict.get(self.outer(previous_key(key)), None) is None for key in self.structure.carry):
             return ~first
-        known = tensordict.get(self.outer(HAS_PREVIOUS), None)  # a policy's data: what has a belief before it is a step
+        known = tensordict.get(self.outer(HAS_PREVIOUS), None)  # for a policy: rows with a previous belief
         return torch.ones_like(first) if known is None else known.reshape(size)
 
     def like(self) -> Tensor | None:
-        """Returns a tensor of the filter's precision and device; ``None`` where it has no parameters or constants."""
+        """Returns a tensor with the filter's dtype and device; ``None`` without parameters or constants."""
         return next((p for p in chain(self.parameters(), self.buffers()) if p.is_floating_point()), None)
 
     def entries_of(self, tensordict: TensorDictBase, *, one_step: bool = False) -> Entries:
-        """Reads the inputs of the modules, and noise, where they are there; for ``one_step`` without initial beliefs.
+        """Returns all available inputs and noise of the modules; ``one_step`` leaves out inputs of initial beliefs.
 
         Raises:
-            KeyError: if there is noise that no module draws.
+            KeyError: if the tensordict has noise that no module draws.
         """
         keys = self._step_keys if one_step else self._all_keys
         entries = {}
@@ -627,7 +628,7 @@ class Filter(Checked, TensorDictSequential):
             if value is not None:
                 entries[key] = value
         drawn = tensordict.get(self._drawn_key, None) if recurrent_mode() and self.keeps_noise else None
-        if drawn is not None:  # those of other modules are not this filter's
+        if drawn is not None:  # draws of other modules are not this filter's
             entries.update((key, value) for key, value in flat_noise(drawn).items() if key[1] in self.draws.places)
         given = tensordict.get(self._noise_key, None)
         if given is not None:
@@ -645,7 +646,7 @@ class Filter(Checked, TensorDictSequential):
         return own(structure.completed(start), entries.values())
 
     def write(self, tensordict: TensorDictBase, written: Entries) -> TensorDictBase:
-        """Sets entries, under their names outside of the filter; looks each nested tensordict up once."""
+        """Writes entries under their outer keys, with one look-up for each nested tensordict."""
         owners: dict[tuple, Any] = {}
         for key, value in written.items():
             if self.fixed_options["prefix"] is not None:
@@ -662,18 +663,18 @@ class Filter(Checked, TensorDictSequential):
         return tensordict
 
     def options(self) -> FilterOptions:
-        """Returns the options that the filter was made with."""
+        """Returns the options of the filter."""
         return cast(FilterOptions, {key: getattr(self, key) for key in FilterOptions.__annotations__})
 
     def of_one_robot(self, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-        """Returns a tensordict as it is; of a dictionary a new one, ``[]``, in the filter's precision and device."""
+        """Converts a dictionary to a tensordict ``[]`` of the filter's dtype and device."""
         return of_one_robot(type(self).__name__, self.like(), tensordict)
 
 
 def _shallow(module: torch.nn.Module) -> Any:
-    """Copies a module whose sub-modules can be exchanged without those of the original."""
+    """Returns a shallow copy of a module, whose sub-modules can be replaced without changing the original."""
     new = copy(module)
     for name, value in vars(module).items():
-        if isinstance(value, dict) and name.startswith("_"):  # torch's, of parameters, buffers, modules and hooks
+        if isinstance(value, dict) and name.startswith("_"):  # parameters, buffers, modules and hooks
             vars(new)[name] = value.copy()
     return new

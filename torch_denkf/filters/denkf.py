@@ -35,22 +35,23 @@ class DEnKF(Filter):
 
     Args:
         transition: :math:`f_\theta`, forecasts ``("forecast", "ensemble")``.
-        sensor: :math:`s_\xi`, writes ``("sensor", "ensemble")``; ``None`` where the reading is in the tensordict, under
+        sensor: :math:`s_\xi`, writes ``("sensor", "ensemble")``; ``None`` if the reading is in the tensordict, under
             ``observation_key``.
         observation: :math:`h_\psi`, writes ``("forecast", "observation")``.
         noise: :math:`r_\zeta`, writes ``("sensor", "noise")``.
         analysis: the update; ``EnsembleAnalysis("sensor")`` by default, and ``EnsembleAnalysis("perturbed")`` without a
             sensor.
         initial: the initial belief, which also fixes the number of members.
-        process_noise: Q of the motion, besides the noise of the transition's network: standard deviations ``[S]`` (a
-            number for all, 0 for none), or a module that writes Q, see :mod:`torch_denkf.modules.process_noise`. An
-            ensemble without any process noise collapses. ``None``: the transition's own noise alone.
+        process_noise: Q of the motion, in addition to the noise of the transition's network: standard deviations
+            ``[S]`` (one number for all, 0 for none), or a module that writes Q, see
+            :mod:`torch_denkf.modules.process_noise`. An ensemble without any process noise collapses. ``None``: only
+            the transition's own noise.
         **options: ``reading_space``, ``observation_key``, ``observed_key``, for the default ``analysis``,
-            ``visibility``, ``sensor_error`` and what every filter takes, see
+            ``visibility``, ``sensor_error`` and the common options of filters, see
             :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
-        ValueError: if it is not clear where the reading is.
+        ValueError: if the source of the reading is ambiguous.
 
     Reference:
         Liu, Clark, Campbell, Zhou, Ben Amor, "Enhancing state estimation in robots: a data-driven approach with
@@ -79,8 +80,8 @@ class DEnKF(Filter):
         if analysis is not None:
             if any(options.get(name) is not None for name in ("reading_space", "observation_key", "observed_key")):
                 raise ValueError(
-                    "reading_space, observation_key and observed_key are for the default analysis; give them to yours "
-                    "instead."
+                    "reading_space, observation_key and observed_key are for the default analysis; pass them to your "
+                    "own analysis instead."
                 )
             options["reading_space"] = role(analysis, Update).reading_space
         parts = FilterParts(transition, sensor, observation, noise, initial, process_noise, **options)
@@ -108,9 +109,9 @@ class DEnKF(Filter):
         Args:
             state_dim: S.
             observation_dim: O.
-            image_shape: of ``"pixels"``, (channels, height, width).
+            image_shape: shape of ``"pixels"``, (channels, height, width).
             ensemble_size: E; the paper has 32.
-            rate: drop probability of the stochastic layers; the paper does not say. Earlier code of its authors
+            rate: drop probability of the stochastic layers; the paper does not give it. Earlier code of its authors
                 has 0.1.
             r: observation noise before training, a standard deviation.
             initial: the initial belief; N(0, I) of the standardised state by default.
@@ -146,17 +147,17 @@ class DEnKF(Filter):
         initial: TensorDictModuleBase | None = None,
         **kwargs,
     ) -> DEnKF:
-        """Returns the layer kinds and widths of the authors' PyTorch code, which differ from Table I.
+        """Returns a filter with the layers and widths of the authors' PyTorch code, which differ from Table I.
 
-        Flipout layers of widths 64, 512, 256 in a residual transition; an observation model of widths 64, 128, 128,
-        64; a sensor of three pooled convolutions, a 512-wide and a 64-wide flipout layer; a noise model of width 32
-        on the sensor's 64-wide encoding. The code's dropout between convolutions is left out: it would tie the
-        trunk's randomness to ``.training``.
+        It has flipout layers of widths 64, 512, 256 in a residual transition; an observation model of widths 64, 128,
+        128, 64; a sensor of three pooled convolutions, a 512-wide and a 64-wide flipout layer; a noise model of width
+        32 on the sensor's 64-wide encoding. The code's dropout between convolutions is left out, because the
+        trunk's randomness would then depend on ``.training``.
 
         Args:
             state_dim: S.
             observation_dim: O.
-            image_shape: of ``"pixels"``, (channels, height, width).
+            image_shape: shape of ``"pixels"``, (channels, height, width).
             ensemble_size: E; the code has 32.
             r: observation noise before training, a standard deviation.
             initial: the initial belief; N(0, I) of the standardised state by default.
@@ -187,7 +188,7 @@ def _standard_prior(state_dim: int, ensemble_size: int) -> GaussianPrior:
 
 
 def _reference_trunk(image_shape: tuple[int, int, int]) -> nn.Sequential:
-    """Convolutions 5/16 s2, 5/32 s2, 3/64 s1 with pooling, then a 512-wide layer."""
+    """Returns convolutions 5/16 s2, 5/32 s2, 3/64 s1 with pooling, then a 512-wide layer."""
     layers, channels = [], image_shape[0]
     for width, kernel, stride in ((16, 5, 2), (32, 5, 2), (64, 3, 1)):
         layers += [nn.Conv2d(channels, width, kernel, stride, kernel // 2), nn.ReLU(), nn.MaxPool2d(2, ceil_mode=True)]

@@ -1,4 +1,4 @@
-"""The differentiable extended Kalman filter: the same sub-models as an ensemble filter's, and their Jacobians."""
+"""The differentiable extended Kalman filter, with the sub-models of an ensemble filter and their Jacobians."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ __all__ = ["EKF"]
 class EKF(Filter):
     """Extended Kalman filter whose transition, sensor, observation and noise models may all be learned (dEKF).
 
-    It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise: what an ensemble filter's
-    stochastic transition does with its members, a covariance Q does here. Its belief is ``("belief", "mean")``
-    ``[*B, S]``, ``("belief", "cov")`` ``[*B, S, S]`` and ``("belief", "var")`` ``[*B, S]``. Where nothing is observed
-    the covariance still grows by F P F^T + Q.
+    It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise: its covariance Q takes the role of
+    an ensemble filter's stochastic transition. Its belief is ``("belief", "mean")`` ``[*B, S]``, ``("belief", "cov")``
+    ``[*B, S, S]`` and ``("belief", "var")`` ``[*B, S]``. If nothing is observed the covariance still grows to
+    F P F^T + Q.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``; its stochastic networks run their deterministic forward.
-        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` where the
+        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` if the
             reading is in the tensordict, under ``observation_key``.
         observation: observes ensembles, writes ``("forecast", "observation")``.
         noise: R, writes ``("sensor", "noise")``: variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
-        process_noise: Q: standard deviations ``[S]`` (a number for all, 0 for none), or a module that writes it, see
+        process_noise: Q: standard deviations ``[S]`` (one number for all, 0 for none), or a module that writes it, see
             :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief: :class:`~torch_denkf.modules.MomentPrior`,
             :class:`~torch_denkf.modules.GaussianAround`.
-        stop_jacobian_gradient: the transition's Jacobian is a constant to the gradient.
-        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
-            by it without bound.
-        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility``, ``sensor_error`` and what
-            every filter takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+        stop_jacobian_gradient: whether the transition's Jacobian is a constant to the gradient.
+        inflation: factor of the belief's standard deviations where anything is observed. Components that are never
+            observed grow by it without bound.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility``, ``sensor_error`` and the
+            common options of filters, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
-        ValueError: if it is not clear where the reading is, or ``initial`` writes no mean and covariance.
+        ValueError: if the source of the reading is ambiguous, or ``initial`` writes no mean and covariance.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.

@@ -1,4 +1,4 @@
-"""Finishes a step before a tensordict gets what it wrote: is the belief finite, and in memory of its own?"""
+"""Finishes a step before its outputs are written: checks that the belief is finite, and clones shared memory."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ RUNS = ("step", "sequence", "policy", "environment")
 
 
 class Record(NamedTuple):
-    """One run of a filter, as its observers see it before anything is written.
+    """One run of a filter, passed to its observers before anything is written.
 
     Attributes:
         way: ``"step"``, ``"sequence"``, ``"policy"`` or ``"environment"``; ``"data"`` for a batch that a loss or a
-            replay buffer is about to filter: nothing is written then.
-        tensordict: what the filter read from, as it was given.
-        batch_size: of the entries; differs from the tensordict's where slices lie end to end.
-        entries: what the modules read.
-        written: what they wrote; of a sequence ``[*B, T, ...]``.
-        env: the environment, where there is one.
+            replay buffer is about to filter, for which nothing is written.
+        tensordict: the tensordict passed to the filter.
+        batch_size: batch size of the entries; differs from the tensordict's for concatenated slices.
+        entries: inputs of the modules.
+        written: outputs of the modules; for a sequence ``[*B, T, ...]``.
+        env: the environment, if there is one.
     """
 
     way: Literal["step", "sequence", "policy", "environment", "data"]
@@ -48,8 +48,8 @@ class Record(NamedTuple):
 
 
 def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
-    """Clones entries that are views, or that the caller gave: what a filter writes is its own."""
-    if torch.compiler.is_compiling():  # what a graph returns is its own
+    """Clones entries that are views or share the caller's memory, so that the filter's outputs own their memory."""
+    if torch.compiler.is_compiling():  # a graph returns its own memory
         return written
     seen, out = set(map(id, given)), {}
     for key, value in written.items():
@@ -59,27 +59,27 @@ def own(written: Entries, given: Iterable[Tensor] = ()) -> Entries:
 
 
 def check_belief(structure: Structure, entries: Entries, written: Entries) -> None:
-    """Raises where the new belief is not finite, or the one that the step started from.
+    """Raises if the new belief, or the belief before the step, is not finite.
 
     Args:
-        structure: of the filter.
-        entries: what the step read.
-        written: what it wrote.
+        structure: structure of the filter.
+        entries: inputs of the step.
+        written: outputs of the step.
 
     Raises:
-        ValueError: that names the cause.
+        ValueError: names the cause.
     """
-    if on_gpu(written[structure.carry[0]]):  # to look would wait for the device
+    if on_gpu(written[structure.carry[0]]):  # reading values would wait for the device
         return
     numbers = [
         (value.sum() if kind is None else kind.finite(key[-1], value).log(), key, kind, value)
         for key, kind in structure.carried
-        for value in (written[key], entries.get(key))  # a particle that is not finite may have been resampled away
+        for value in (written[key], entries.get(key))  # resampling may have removed a particle that is not finite
         if value is not None and value.is_floating_point()
     ]
     total = sum([number for number, *_ in numbers[1:]], numbers[0][0]) if numbers else torch.zeros(())
     if flag_value(total - total == 0) is not False:  # fewer calls than isfinite() takes
         return
-    if all((kind or Belief()).finite(key[-1], value) for _, key, kind, value in numbers):  # their sum alone is not
+    if all((kind or Belief()).finite(key[-1], value) for _, key, kind, value in numbers):  # only their sum overflowed
         return
     raise ValueError(diagnosis().why_not_finite(structure, entries, written))

@@ -1,4 +1,4 @@
-"""Gathers what steps read: entries of a tensordict, and the belief that each element of a sequence starts from."""
+"""Gathers the inputs of steps: entries of a tensordict, and the initial or stored belief of each element."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class StepInputs(NamedTuple):
     Attributes:
         size: ``[*B, T]``.
         inputs: entries ``[*B, T, ...]``.
-        begins: elements that are reset to ``starts``, ``[*B, T, 1]``; ``[*B, 1, 1]`` where the first alone may be.
+        begins: elements that are reset to ``starts``, ``[*B, T, 1]``; ``[*B, 1, 1]`` if only the first may be.
         starts: initial or stored beliefs, ``[*B, T]`` or ``[*B, 1]``.
         stored: whether these beliefs are stored ones, which have seen their frame.
         before: the belief before the first element.
@@ -45,7 +45,7 @@ class StepInputs(NamedTuple):
 
 
 def of_one_robot(name: str, like: Tensor | None, tensordict: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
-    """Returns a tensordict as it is; of a dictionary a new one, ``[]``, in the dtype and on the device of ``like``."""
+    """Returns a tensordict unchanged; a dictionary as a new one, ``[]``, with the dtype and device of ``like``."""
     if isinstance(tensordict, TensorDictBase):
         return tensordict
     if not isinstance(tensordict, Mapping):
@@ -53,7 +53,7 @@ def of_one_robot(name: str, like: Tensor | None, tensordict: TensorDictBase | Ma
             f"{name} takes a tensordict, or a dictionary of numbers, arrays or tensors; got {type(tensordict).__name__}"
         )
     out = TensorDict(dict(tensordict), batch_size=[])
-    out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number is an entry of one
+    out = out.apply(lambda value: value.reshape(1) if value.ndim == 0 else value)  # a number becomes an entry [1]
     if like is None:
         return out
     return out.apply(lambda value: value.to(like.device, like.dtype if value.is_floating_point() else None))
@@ -66,14 +66,14 @@ def gather_rows(
     size: torch.Size,
     start_of: Callable[[Entries, Call], Entries],
 ) -> StepInputs:
-    """Finds where each element of a sequence starts from, and what its step reads.
+    """Collects the initial belief of each element of a sequence, and the inputs of its step.
 
     Args:
-        structure: of the filter.
-        entries: of the sequence, with what the frames' modules wrote.
+        structure: structure of the filter.
+        entries: entries of the sequence, with the outputs of the frames' modules.
         marks: first elements, see :func:`torch_denkf._slices.starts_of`.
         size: ``[*B, T]``.
-        start_of: the initial beliefs, from entries.
+        start_of: returns the initial beliefs, from entries.
     """
     time, call, carry = len(size) - 1, Call(size, time=True), structure.carry
     resumed = all(previous_key(key) in entries for key in carry)
@@ -85,13 +85,13 @@ def gather_rows(
     one = torch.Size((*size[:-1], 1))
     if stored:
         starts = structure.completed({key: entries[key] for key in carry}, entries)
-    elif marks is None and not resumed:  # where only the first element starts, only its initial belief is needed
+    elif marks is None and not resumed:  # only the first element needs an initial belief
         starts = start_of(head, call._replace(batch_size=one))
     else:
         starts = start_of(entries, call)
     device = starts[carry[0]].device
     begins = torch.ones(*one, 1, dtype=torch.bool, device=device) if marks is None else _or_first(marks, size, device)
-    if resumed:  # a policy's data: what is known before an element is where its step begins
+    if resumed:  # a policy's data: each step starts from the stored previous belief
         if not all(previous_key(key) in entries for key in structure.required_controls):
             diagnosis().check_actions(structure, entries)
         first = _or_first(marks, size, device)
@@ -104,11 +104,11 @@ def gather_rows(
 
 
 def controls_of(structure: Structure, entries: Entries, time: int) -> Entries:
-    """Returns what drives the step to each time, which is stored one step earlier than it is read.
+    """Returns the controls of the step to each time; data have them one step earlier.
 
     Args:
-        structure: of the filter.
-        entries: of a sequence.
+        structure: structure of the filter.
+        entries: entries of a sequence.
         time: the dimension of time.
     """
     moved = {key: one_earlier(entries[key], time) for key in structure.controls if key in entries}
@@ -116,7 +116,7 @@ def controls_of(structure: Structure, entries: Entries, time: int) -> Entries:
 
 
 def _or_first(marks: Tensor | None, size: torch.Size, device: torch.device) -> Tensor:
-    """Marks ``[*B, T, 1]``, and the first element of each sequence."""
+    """Marks ``[*B, T, 1]`` the given elements, and the first element of each sequence."""
     first = torch.zeros(*size, 1, dtype=torch.bool, device=device)
     first.narrow(len(size) - 1, 0, 1).fill_(True)
     return first if marks is None else first | marks.reshape(*size, 1)

@@ -1,4 +1,4 @@
-"""The exact filter of linear-Gaussian systems: the oracle of all others, on the same base."""
+"""The exact filter of linear-Gaussian systems, a reference for all others, on the same base."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ class KalmanFilter(Filter):
         process_noise_cov: Q, ``[S, S]``.
         noise: standard deviations of the readings ``[O]``, in their units; or ``noise_cov``.
         noise_cov: R, ``[O, O]``.
-        mean: of the initial belief, ``[S]``.
-        cov: of the initial belief, ``[S, S]``.
-        control: B, ``[S, A]``, of the action; ``None`` for none.
-        reading_space: in which the reading lives, one of numbers and angles such as ``Euclidean(1) * Circle()``;
+        mean: mean of the initial belief, ``[S]``.
+        cov: covariance of the initial belief, ``[S, S]``.
+        control: B, ``[S, A]``, the matrix of the action; ``None`` for none.
+        reading_space: space of the reading, made of numbers and angles, such as ``Euclidean(1) * Circle()``;
             ``None`` for plain numbers.
-        sensor_error: errors of the readings that last, :class:`~torch_denkf.imperfect.FadingBias`: they become part of
-            the state, behind its S components, as large and as long as they are now.
+        sensor_error: biases of the readings, :class:`~torch_denkf.imperfect.FadingBias`: they become part of
+            the state, after its S components, with the present values of their parameters.
         observation_key: readings ``[*B, O]``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        **kwargs: ``control_keys``, of which the first drives the transition where ``control`` is given, ``init_key``,
+        **kwargs: ``control_keys``, of which the first drives the transition if ``control`` is given, ``init_key``,
             ``update_at_reset``, ``variance_ceiling``, ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Raises:
@@ -107,7 +107,7 @@ class KalmanFilter(Filter):
 
 
 def _covariance(name: str, given: dict[str, torch.Tensor], size: int, shape: str) -> torch.Tensor:
-    """Returns variances of standard deviations ``name``, or the covariance ``name_cov``."""
+    """Returns the variances for standard deviations ``name``, or the covariance ``name_cov``."""
     if (name in given) == (f"{name}_cov" in given):
         raise ValueError(f"Give {name}, standard deviations {shape}, or {name}_cov, a matrix, and not both.")
     if name not in given:

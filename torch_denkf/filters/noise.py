@@ -1,4 +1,4 @@
-"""Draws the noise of all modules of a filter in bulk; one trial step tells which module draws what."""
+"""Draws the noise of all modules of a filter in bulk; one trial step finds the modules and sizes."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ if TYPE_CHECKING:
 
 __all__ = ["Drawn", "Draws", "recorded_draws"]
 
-#: The sub-models that draw noise, by place, and the sizes that they asked for.
+#: The sub-models that draw noise, by place, and the requested sizes.
 Drawn = dict[str, tuple[SubModel, dict[str, Any]]]
 
 
 @contextmanager
 def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> Iterator[Drawn]:
-    """Records the sizes that sub-models ask for when they draw noise, without a trace of that.
+    """Records the sizes that sub-models request when they draw noise, without side effects.
 
     Forward hooks are not called meanwhile. Networks are in evaluation mode: a batch normalisation of one row raises,
-    and one of several would count them.
+    and several rows would change its running statistics.
 
     Args:
-        filter: whose modules they are.
-        parts: sub-models that draw noise, and their places.
+        filter: the filter of the sub-models.
+        parts: sub-models that draw noise, with their places.
     """
     drawn: Drawn = {}
     places = dict(parts)
 
     def record(place: str, part: SubModel, sizes: dict[str, Any]) -> None:
-        own = [place] if place in places else [name for name, other in parts if other is part]  # in its own forward
+        # A sub-model that overrides forward() draws without its place in the filter.
+        own = [place] if place in places else [name for name, other in parts if other is part]
         drawn.update(dict.fromkeys(own, (part, sizes)))
 
     before = [(part, part._forward_hooks, part._forward_pre_hooks, part.training) for part in filter.modules()]
@@ -46,7 +47,7 @@ def recorded_draws(filter: nn.Module, parts: Sequence[tuple[str, SubModel]]) -> 
     try:
         for part, *_ in before:
             part._forward_hooks, part._forward_pre_hooks = OrderedDict(), OrderedDict()
-            part.training = part.training and isinstance(part, SubModel)  # whose noise may depend on it
+            part.training = part.training and isinstance(part, SubModel)  # a sub-model's noise may depend on it
         yield drawn
     finally:
         RECORDERS.remove(record)
@@ -58,10 +59,10 @@ class Draws:
     """Draws the noise of a filter's modules.
 
     Args:
-        filter: whose modules they are.
+        filter: the filter of the modules.
 
     Attributes:
-        places: of the modules that draw any.
+        places: places of the modules that draw noise.
     """
 
     def __init__(self, filter: Filter):
@@ -80,12 +81,12 @@ class Draws:
         time: bool = False,
         generator: torch.Generator | None = None,
     ) -> Entries:
-        """Draws the noise that is not among the entries; one trial step tells the sizes.
+        """Draws the noise that is not among the entries, with the sizes of one trial step.
 
         Args:
-            entries: what the modules read, some of which may be noise.
+            entries: inputs of the modules, possibly with some noise.
             size: ``[*B]``, or ``[*B, T]``.
-            places: of the modules in the filter; by default those of a step.
+            places: places of the modules in the filter; by default those of a step.
             time: whether the last of ``size`` is time.
             generator: source of randomness; torch's global one by default.
         """
@@ -94,7 +95,7 @@ class Draws:
         shapes = {
             key: value.shape[len(size) :] for key, value in entries.items() if key[0] not in ("noise", "previous")
         }
-        # Modules may draw at some times and not at others, as those under `deterministic` do.
+        # Modules may draw at some times only, such as under `deterministic`.
         kind = (*sorted(shapes.items(), key=str), *(part.noise_names for _, part in self._random))
         if kind not in self._drawn:
             self._drawn[kind] = self._trial(entries, size)
@@ -109,7 +110,7 @@ class Draws:
         return out
 
     def nothing(self, batch_size: Sequence[int]) -> Entries:
-        """Returns zeros for what the initial belief reads, where its shape alone counts."""
+        """Returns zeros for the inputs of the initial belief, for runs that need only shapes."""
         told, like = role(self.filter.initial, Initial), self.filter.like()
         like = torch.zeros(()) if like is None else like
         zeros = like.new_zeros(*batch_size, told.input_dim or told.state_dim or 1)
@@ -117,7 +118,7 @@ class Draws:
 
     @torch.no_grad()
     def _trial(self, entries: Entries, size: torch.Size) -> Drawn:
-        """Finds which modules draw noise in a step, and of what sizes, by one step of the first element."""
+        """Finds the modules that draw noise, and the sizes, by one step of the first element."""
         row = {key: value for key, value in entries.items() if key[0] != "noise"}
         if size.numel():
             row = {key: value.flatten(0, len(size) - 1)[:1] if size else value for key, value in row.items()}
@@ -131,7 +132,7 @@ class Draws:
             recorded_draws(self.filter, self._random) as drawn,
         ):
             start = run_module(self.filter.initial, {**self.nothing(call.batch_size), **row}, call.part("initial"))
-            # Where an entry has not come yet, what reads it asks for what it did before; the step itself raises.
+            # If an entry is missing, the modules that read it keep their sizes; the step itself raises.
             with suppress(KeyError, *EXPLAINED):
                 self.filter.steps.step({**start, **row}, call, partial=True)
         self._sizes |= drawn

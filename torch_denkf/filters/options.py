@@ -11,7 +11,7 @@ __all__ = ["FilterOptions"]
 
 
 class FilterOptions(TypedDict, total=False):
-    """Declares the options of every filter's constructor, next to its parts; see :class:`Filter`."""
+    """Options of every filter's constructor, in addition to its parts; see :class:`Filter`."""
 
     control_keys: Sequence[NestedKey]
     init_key: NestedKey

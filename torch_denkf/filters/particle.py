@@ -21,37 +21,37 @@ class ParticleFilter(Filter):
     r"""Particle filter: each step resamples, moves the particles, and weights them with the reading's likelihood.
 
     Its belief is the particles ``("belief", "ensemble")`` ``[*B, E, S]`` and their normalised log-weights
-    ``("belief", "log_weight")`` ``[*B, E]``, both carried on, with weighted ``("belief", "mean")`` and
+    ``("belief", "log_weight")`` ``[*B, E]``, both carried, with weighted ``("belief", "mean")`` and
     ``("belief", "var")``. With the true models, Gaussian likelihood and systematic resampling it is the bootstrap
     filter (Gordon, Salmond & Smith 1993), whose error falls like :math:`1/\sqrt{E}`.
 
     Args:
         transition: forecasts ``("forecast", "ensemble")``; its randomness is the motion noise, see
-            :class:`~torch_denkf.modules.NoisyTransition`. Without any, particles become copies of one.
-        sensor: writes ``("sensor", "ensemble")`` or an encoding; ``None`` where the reading is in the tensordict, under
-            ``observation_key``, or where ``likelihood`` says.
+            :class:`~torch_denkf.modules.NoisyTransition`. Without any noise, particles become copies of one.
+        sensor: writes ``("sensor", "ensemble")`` or an encoding; ``None`` if the reading is in the tensordict, under
+            ``observation_key``, or if ``likelihood`` has the key.
         observation: writes the predicted observations ``("forecast", "observation")``.
         likelihood: writes ``("forecast", "log_likelihood")``; a Gaussian one by default.
         analysis: the update, :class:`~torch_denkf.modules.particles.ParticleAnalysis` by default. With a Gaussian
-            likelihood that writes ``("info", "innovation")`` and ``("info", "nis")``, too.
-        noise: writes ``("sensor", "noise")``, for a Gaussian likelihood; ``None`` where none is needed.
+            likelihood it also writes ``("info", "innovation")`` and ``("info", "nis")``.
+        noise: writes ``("sensor", "noise")``, for a Gaussian likelihood; ``None`` if none is needed.
         resampling: ``"systematic"``, ``"soft"``, ``"transport"`` or ``None``, see
-            :class:`~torch_denkf.modules.particles.ResampledTransition`; a transition that is one already is left as it
-            is.
+            :class:`~torch_denkf.modules.particles.ResampledTransition`; a ``transition`` of this class is used
+            unchanged.
         alpha: share of the uniform distribution in soft resampling.
         epsilon: regularisation of transport.
-        ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
-        jitter: regularised particle filter: the copies that resampling makes are moved apart by a Gaussian kernel of
-            this many times the usual width. For motions with little noise of their own, or none.
-        initial: the initial belief, which also fixes the number of particles; weights are added where it has none.
-        process_noise: Q of the motion, besides the transition's own noise: standard deviations ``[S]`` (a number for
-            all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
-        **options: ``reading_space`` and ``observation_key``, for the default likelihood, ``observed_key``, which
-            resampling heeds, too, ``visibility``, for a Gaussian likelihood, ``sensor_error`` and what every filter
-            takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+        ess_threshold: resamples only if the effective number of particles is below this share of E. ``None``: always.
+        jitter: regularised particle filter: separates the copies of resampling by a Gaussian kernel of
+            this many times the usual width. For motions with little or no noise.
+        initial: the initial belief, which also fixes the number of particles; weights are added if it has none.
+        process_noise: Q of the motion, in addition to the transition's own noise: standard deviations ``[S]`` (one
+            number for all), or a module that writes Q, see :class:`~torch_denkf.modules.NoisyTransition`.
+        **options: ``reading_space`` and ``observation_key``, for the default likelihood; ``observed_key``, also used by
+            resampling; ``visibility``, for a Gaussian likelihood; ``sensor_error`` and the common options of
+            filters, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
-        ValueError: on an unknown ``resampling``, or if it is not clear where the reading is.
+        ValueError: on an unknown ``resampling``, or if the source of the reading is ambiguous.
 
     Example:
         >>> import torch
@@ -93,7 +93,7 @@ class ParticleFilter(Filter):
         check_choice("resampling", resampling, ("systematic", "soft", "transport", None))
         more = process_noise is not None or options.get("sensor_error") is not None
         if more and isinstance(transition, ResampledTransition):
-            raise ValueError("A ResampledTransition holds its motion: put process noise and sensor_error into that.")
+            raise ValueError("Add process noise and sensor_error to the motion inside the ResampledTransition.")
         parts = FilterParts(
             transition, sensor, observation, noise, initial, process_noise, optional=["noise"], **options
         )
@@ -101,7 +101,7 @@ class ParticleFilter(Filter):
             likelihood = GaussianLikelihood(**parts.reading(", or a likelihood"))
         elif parts.reading_space is not None or parts.observation_key is not None:
             raise ValueError(
-                "reading_space and observation_key are for the default likelihood; give them to yours instead, "
+                "reading_space and observation_key are for the default likelihood; pass them to your own, "
                 "the key as observation_key= of a GaussianLikelihood, or as encoding_key= or observation_key= of a "
                 "LearnedLikelihood."
             )
@@ -129,22 +129,22 @@ class ParticleFilter(Filter):
 
 
 class DPF(ParticleFilter):
-    """Differentiable particle filter of Jonschkowski et al.: all learned, hard resampling that ends the gradient.
+    """Differentiable particle filter of Jonschkowski et al.: learned models, and hard resampling that stops gradients.
 
-    Train it with :class:`torch_denkf.objectives.MixtureLoss`: the likelihood of each step learns from that step's
-    belief alone.
+    Train it with :class:`torch_denkf.objectives.MixtureLoss`: the likelihood of each step is then trained by that
+    step's belief only.
 
     Args:
         transition: forecasts ``("forecast", "ensemble")``.
-        sensor: writes the encoding that ``likelihood`` reads.
+        sensor: writes the encoding, the input of ``likelihood``.
         observation: writes ``("forecast", "observation")``.
         likelihood: learned, bounded from below, see :class:`~torch_denkf.modules.LearnedLikelihood`.
         motion_noise: learned variances of some dimensions of the state, see
-            :class:`~torch_denkf.modules.NoisyTransition`; ``None`` where ``transition`` is random already.
-        noisy_dims: those dimensions. The noise is added before the motion; to have it after, give a ``transition`` with
-            noise instead.
+            :class:`~torch_denkf.modules.NoisyTransition`; ``None`` if ``transition`` is random already.
+        noisy_dims: those dimensions. The noise is added before the motion; for noise after it, use a ``transition``
+            with noise instead.
         initial: the initial belief.
-        **kwargs: of :class:`ParticleFilter`.
+        **kwargs: arguments of :class:`ParticleFilter`.
 
     Reference:
         Jonschkowski, Rastogi & Brock, "Differentiable particle filters: end-to-end learning with algorithmic priors",
@@ -187,20 +187,20 @@ class DPF(ParticleFilter):
 class MixtureParticleFilter(ParticleFilter):
     """Differentiable particle filters of Kloss et al. for the mixture loss: dPF-M and dPF-M-lrn.
 
-    Soft resampling in every step, so that the gradient goes on from step to step; "M" is the loss,
+    They use soft resampling in every step, so that gradients continue from step to step; "M" is the loss,
     :class:`torch_denkf.objectives.MixtureLoss`, and "lrn" the likelihood.
 
     Args:
         transition: forecasts ``("forecast", "ensemble")``.
-        sensor: writes ``("sensor", "ensemble")``, or the encoding that ``learned_likelihood`` reads; ``None`` where the
-            reading is in the tensordict, under ``observation_key``.
+        sensor: writes ``("sensor", "ensemble")``, or the encoding, the input of ``learned_likelihood``; ``None`` if
+            the reading is in the tensordict, under ``observation_key``.
         observation: writes ``("forecast", "observation")``.
-        noise: writes ``("sensor", "noise")``, of the Gaussian likelihood; not needed with a learned one.
+        noise: writes ``("sensor", "noise")``, for the Gaussian likelihood; not needed with a learned one.
         learned_likelihood: a :class:`~torch_denkf.modules.LearnedLikelihood`, theirs is ``bound="clipped"``;
             ``None`` for the Gaussian one.
         initial: the initial belief.
         alpha: share of the uniform distribution in soft resampling.
-        **kwargs: of :class:`ParticleFilter`, such as ``observation_key``.
+        **kwargs: arguments of :class:`ParticleFilter`, such as ``observation_key``.
 
     Raises:
         ValueError: if neither ``noise`` nor ``learned_likelihood`` is given.

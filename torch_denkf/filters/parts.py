@@ -1,4 +1,4 @@
-"""The modules of a filter of one sensor: checked once, and with them what an imperfect sensor adds."""
+"""The modules of a filter with one sensor: checks them, and adds models of sensor errors and visibility."""
 
 from __future__ import annotations
 
@@ -21,40 +21,41 @@ __all__ = ["FilterParts", "ReadingOptions", "SensorError", "Visibility", "check_
 
 @runtime_checkable
 class SensorError(Protocol):
-    """Errors of a sensor that last and become part of the state: :class:`~torch_denkf.imperfect.FadingBias`."""
+    """Coloured errors of a sensor, which become part of the state: :class:`~torch_denkf.imperfect.FadingBias`."""
 
     def augmented(self, transition, observation, process_noise, initial, reading_space=None):
-        """Returns transition, observation, process noise and initial belief of the state with the errors behind it."""
+        """Returns transition, observation, process noise and initial belief of the state extended by the errors."""
 
     def augmented_matrices(self, f, h, q, mean, cov, control=None):
-        """Returns F, H, Q, mean, covariance and B of the state with the errors behind it."""
+        """Returns F, H, Q, mean, covariance and B of the state extended by the errors."""
 
 
 @runtime_checkable
 class Visibility(Protocol):
-    """A head next to a sensor that says whether it sees: :class:`~torch_denkf.imperfect.Visibility`."""
+    """A head of a sensor that estimates whether a reading is visible: :class:`~torch_denkf.imperfect.Visibility`."""
 
     def heeded_by(self, analysis):
-        """Returns an update that lets a reading count as far as the head says."""
+        """Returns an update that weighs a reading by the head's estimate."""
 
 
 class ReadingOptions(FilterOptions, total=False):
-    """The options of filters of one sensor, besides their modules.
+    """Options of filters with one sensor, in addition to their modules.
 
     They also take ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
     ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Attributes:
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` by default, for plain
-            numbers. That of the state is the initial belief's.
-        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; by default the one that the sensor writes.
+        reading_space: space of the reading, such as ``Circle()`` for an angle; ``None`` by default, for plain
+            numbers. The state has the space of the initial belief.
+        observation_key: the reading, ``[*B, O]`` or ``[*B, E, O]``; by default the output of the sensor.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, by default ``"observed"``; a nonlinear observation model
             may write it.
-        visibility: a head next to the sensor that says whether it sees, :class:`~torch_denkf.imperfect.Visibility`; the
-            update heeds it, see :class:`~torch_denkf.imperfect.Visible`. ``None`` by default.
+        visibility: a head of the sensor that estimates whether a reading is visible,
+            :class:`~torch_denkf.imperfect.Visibility`; the update uses it, see
+            :class:`~torch_denkf.imperfect.Visible`. ``None`` by default.
         sensor_error: coloured errors of the sensor, such as a :class:`~torch_denkf.imperfect.FadingBias`: they become
-            part of the state, behind its S components, of transition, process noise, observation and initial belief.
-            All these are given for the state alone. ``None`` by default.
+            part of the state, after its S components. Transition, process noise, observation and initial belief
+            are given for the state without them. ``None`` by default.
     """
 
     reading_space: Space | None
@@ -65,25 +66,25 @@ class ReadingOptions(FilterOptions, total=False):
 
 
 class FilterParts:
-    """The modules of a filter of one sensor, from which its constructor makes the forecast and the update.
+    """The modules of a filter with one sensor, from which its constructor makes the forecast and the update.
 
     Args:
-        transition: moves the state.
-        sensor: writes the reading; ``None`` where it is in the tensordict.
+        transition: forecasts the state.
+        sensor: writes the reading; ``None`` if it is in the tensordict.
         observation: predicts the reading.
         noise: writes R.
         initial: the initial belief.
-        process_noise: Q, as :func:`~torch_denkf.modules.process_noise.as_process_noise` takes it; ``None`` for none.
-        optional: those of the modules that may be ``None``.
+        process_noise: Q, see :func:`~torch_denkf.modules.process_noise.as_process_noise`; ``None`` for none.
+        optional: names of the modules that may be ``None``.
         reading_space: see :class:`ReadingOptions`.
-        observation_key: likewise.
-        observed_key: likewise.
-        visibility: likewise.
-        sensor_error: likewise.
-        **options: of :class:`Filter`, handed on.
+        observation_key: see :class:`ReadingOptions`.
+        observed_key: see :class:`ReadingOptions`.
+        visibility: see :class:`ReadingOptions`.
+        sensor_error: see :class:`ReadingOptions`.
+        **options: options of :class:`Filter`, passed on.
 
     Raises:
-        TypeError: for what is no module, no error of a sensor, no visibility.
+        TypeError: if an argument is no module, no ``sensor_error`` or no ``visibility``.
 
     Example:
         >>> import torch
@@ -131,24 +132,24 @@ class FilterParts:
         self.space = role(initial, Initial).space
 
     def moving(self) -> TensorDictModuleBase:
-        """Returns the transition of ensembles, with the process noise where there is one."""
+        """Returns the transition of ensembles, with the process noise if there is one."""
         if self.process_noise is None:
             return self.transition
         return NoisyTransition(self.transition, self.process_noise, space=self.space)
 
     def reading(self, or_part: str = "") -> dict[str, Any]:
-        """Returns the keys and the spaces of the reading, as an update takes them.
+        """Returns the keys and the space of the reading, as options of an update.
 
         Args:
-            or_part: what else would say where the reading is, for the message.
+            or_part: other arguments that would define the source of the reading, for the message.
 
         Raises:
-            ValueError: if it is not clear where the reading is.
+            ValueError: if the source of the reading is ambiguous.
         """
         key = self.observation_key
         if key is None:
             if self.sensor is None:
-                raise ValueError(f"Without a sensor, say where the reading is: observation_key=...{or_part}")
+                raise ValueError(f"Without a sensor, pass the key of the reading: observation_key=...{or_part}")
             key = reading_of(self.sensor)
         found = {"observation_key": key, "observed_key": self.observed_key, "reading_space": self.reading_space}
         if self.noise is not None:
@@ -156,7 +157,7 @@ class FilterParts:
         return {name: value for name, value in found.items() if value is not None}
 
     def in_order(self, **others: TensorDictModuleBase | None) -> OrderedDict[str, TensorDictModuleBase]:
-        """Returns the modules by name, the ``others`` last, but for ``None``; the ``analysis`` heeds a visibility."""
+        """Returns the modules by name, without ``None``, the ``others`` last; ``analysis`` gets the visibility."""
         if self.visibility is not None:
             others["analysis"] = self.visibility.heeded_by(others["analysis"])
         named = {"sensor": self.sensor, "visibility": self.visibility, "noise": self.noise, **others}
@@ -166,13 +167,13 @@ class FilterParts:
 def check_kind(name: str, value: object) -> None:
     """Raises a ``TypeError`` unless a ``sensor_error`` or a ``visibility`` is one, or ``None``."""
     kind, words = {"sensor_error": (SensorError, "FadingBias"), "visibility": (Visibility, "Visibility")}[name]
-    if value is not None and (isinstance(value, type) or not isinstance(value, kind)):  # a class has the methods, too
+    if value is not None and (isinstance(value, type) or not isinstance(value, kind)):  # a class has them, too
         got = value.__name__ if isinstance(value, type) else type(value).__name__
         raise TypeError(f"{name} is a {words}, or None; got {'the class ' * isinstance(value, type)}{got}")
 
 
 def check_moments(owner: str, initial: TensorDictModuleBase) -> None:
-    """Raises a ``ValueError`` where an initial belief lacks the mean or the covariance that a filter carries."""
+    """Raises a ``ValueError`` if an initial belief lacks the mean or the covariance that a filter carries."""
     carry, written = [("belief", "mean"), ("belief", "cov")], [unravel_key(key) for key in initial.out_keys]
     if not set(carry).issubset(written):
         raise ValueError(

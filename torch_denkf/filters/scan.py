@@ -1,4 +1,4 @@
-"""The steps of a filter, one after the other, on flat dictionaries of tensors: what is run, compiled and exported."""
+"""The steps of a filter, one after the other, on flat dictionaries of tensors, to be run, compiled or exported."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def where_rows(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 class Steps(NamedTuple):
-    """The steps of a filter, which a strategy may run in another way.
+    """The steps of a filter, run eagerly; other strategies may replace them.
 
     Attributes:
-        structure: its modules.
+        structure: the modules.
         update_at_reset: whether the initial belief is updated with its frame.
     """
 
@@ -37,9 +37,9 @@ class Steps(NamedTuple):
     update_at_reset: bool
 
     def run(self, modules: Iterable[Placed], entries: Entries, call: Call, partial: bool = False) -> Entries:
-        """Runs modules one after the other; each finds in ``entries`` what those before it wrote.
+        """Runs modules one after the other; each reads the outputs of those before it from ``entries``.
 
-        Where the entries are ``partial``, some observations are missing: modules that read them are left out, and an
+        If the entries are ``partial``, some observations are missing: modules that need them are skipped, and an
         update gets a mask instead.
         """
         written: Entries = {}
@@ -76,9 +76,9 @@ class Steps(NamedTuple):
         Args:
             entries: the carry, which is the belief at t-1, and the frame of t.
             call: batch size, and whether noise is drawn.
-            frames: whether the modules that read frames are to run; if not, ``entries`` hold what they wrote.
-            reset: rows ``[*B]`` or ``[*B, 1]`` whose forecast, and posterior, is their ``start``; ``None`` for none.
-            start: initial beliefs, or a function of the entries that makes them; read only with ``reset``.
+            frames: whether the modules that read frames run; if not, ``entries`` have their outputs.
+            reset: rows ``[*B]`` or ``[*B, 1]`` to reset: forecast and posterior become ``start``; ``None`` for none.
+            start: initial beliefs, or a function of the entries that returns them; used only with ``reset``.
             forecast: replaces the transition.
             partial: whether observations are missing among the entries, see :meth:`run`.
 
@@ -86,14 +86,14 @@ class Steps(NamedTuple):
             The entries that the modules write.
 
         Raises:
-            KeyError: if no module writes the belief where observations are missing.
+            KeyError: if no module writes the belief when observations are missing.
         """
         structure, entries = self.structure, dict(entries)
         written = self.run(structure.frames, entries, call, partial) if frames and structure.frames else {}
         begin = start or {} if start is None or isinstance(start, dict) else start(entries)
         if forecast is None:
             if reset is not None:
-                # Before the transition, too: its gradient would be NaN where the episode before diverged.
+                # Before the transition, too: after a diverged episode its gradient would be NaN.
                 entries.update({key: where_rows(reset, begin[key], entries[key]) for key in structure.carry})
             place, transition = structure.transition
             forecast = run_module(transition, entries, call._replace(place=place))
@@ -108,8 +108,8 @@ class Steps(NamedTuple):
                 written[key] = sum((written[part] for part in parts[1:]), written[parts[0]])
         if partial and not all(key in written for key in structure.carry):
             raise KeyError(
-                f"Without what is missing no module writes {list(structure.carry)}: give a mask that hides the "
-                "observation, or let the analysis name its reading_keys and its observed_key."
+                f"Without the missing entries no module writes {list(structure.carry)}: give a mask of the missing "
+                "observation, or let the analysis declare its reading_keys and its observed_key."
             )
         if reset is not None and not self.update_at_reset:
             for key in structure.belief:
@@ -117,7 +117,7 @@ class Steps(NamedTuple):
         return written
 
     def begin(self, entries: Entries, call: Call, start: Entries, partial: bool) -> Entries:
-        """Updates an initial belief with its frame; no transition leads to it, as there may be no action yet."""
+        """Updates an initial belief with its frame, without a transition, as there may be no action yet."""
         structure, transition = self.structure, self.structure.transition[1]
         entries = {**entries, **{key: start[key] for key in structure.carry}}
         forecast = {name: start[key] for key, name in structure.forecast_of.items()}
@@ -135,22 +135,21 @@ class Steps(NamedTuple):
         cuts: Sequence[bool],
         keep: Sequence[NestedKey],
     ) -> tuple[Entries, Entries]:
-        """Takes one step after the other.
+        """Runs the steps one after the other.
 
         Args:
             carry: the belief before the first step.
-            inputs: what each step reads in addition to the carry, ``[*B, T, ...]``, with what the frames' modules
-                wrote. What stands under ``("previous", ...)`` is where the step begins in rows that :data:`FROM_STORED`
-                marks.
-            call: of one step ``[*B]``.
-            resets: rows that are reset at each step, ``[*B, T, 1]``; ``[*B, 1, 1]`` where the first step alone has
+            inputs: inputs of each step in addition to the carry, ``[*B, T, ...]``, with outputs of the frames' modules.
+                Rows that :data:`FROM_STORED` marks start from the belief stored under ``("previous", ...)``.
+            call: the call of one step ``[*B]``.
+            resets: rows that are reset at each step, ``[*B, T, 1]``; ``[*B, 1, 1]`` if only the first step has
                 some; ``None`` for none.
-            starts: their beliefs, ``[*B, T, ...]`` or ``[*B, 1, ...]``.
-            cuts: where the belief is detached before the step, T.
-            keep: what to return of each step.
+            starts: beliefs of the reset rows, ``[*B, T, ...]`` or ``[*B, 1, ...]``.
+            cuts: T flags, whether the belief is detached before the step.
+            keep: outputs of each step to return.
 
         Returns:
-            The carry after the last step, and what the steps wrote, ``[*B, T, ...]``.
+            The carry after the last step, and the outputs of the steps, ``[*B, T, ...]``.
         """
         time, outputs = len(call.batch_size), []
         rows = _unbound(inputs, time, len(cuts))
@@ -172,10 +171,10 @@ class Steps(NamedTuple):
         return carry, {key: torch.stack([out[key] for out in outputs], time) for key in keep}
 
     def blank(self, written: Entries, fresh: Tensor) -> None:
-        """Sets to zero what a step writes and an initial belief does not have: innovations and the like.
+        """Sets step outputs that an initial belief lacks, such as innovations, to zero.
 
         Args:
-            written: by a step, or by those of a sequence; changed.
+            written: outputs of a step, or of the steps of a sequence; changed in place.
             fresh: elements that are reset to an initial or stored belief, ``[*B, 1]`` or ``[*B, T, 1]``.
         """
         structure = self.structure
@@ -192,7 +191,7 @@ def _unbound(entries: Entries, time: int, count: int) -> list[Entries]:
 
 
 def _masked(module: Update, entries: Entries, call: Call) -> Entries:
-    """Returns the entries with ones in the place of missing observations, and a mask that says so."""
+    """Returns the entries with ones in place of missing observations, and a mask of them."""
     like = next(entries[key] for key in module.in_keys if key in entries)
     dims = zip(module.reading_keys, module.reading_dims(entries, call), strict=True)
     ones = {

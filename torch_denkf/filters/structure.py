@@ -1,4 +1,4 @@
-"""Sorts a filter's modules by their keys: those that read frames alone, those that read the belief, and the carry."""
+"""Sorts a filter's modules by their keys: those that read only frames, those that read the belief, and the carry."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Placed = tuple[str, TensorDictModuleBase]
 
 #: Key of a flag: a policy has a belief before this element.
 HAS_PREVIOUS = ("previous", "known")
-#: Key of a flag: an element of a sequence begins with the belief that is stored before it.
+#: Key of a flag: an element of a sequence starts from the stored belief before it.
 FROM_STORED = ("previous", "resumes")
 
 
 def previous_key(key: NestedKey) -> tuple[str, ...]:
-    """Returns the key under which a policy's filter finds the value of the step before."""
+    """Returns the key of the previous step's value in a policy's data."""
     return ("previous", key) if isinstance(key, str) else ("previous", *key)
 
 
@@ -36,32 +36,32 @@ def takes_reading(module: TensorDictModuleBase) -> TypeGuard[Update]:
 
 
 class Structure(NamedTuple):
-    """A filter's modules in their order, sorted by what they read.
+    """A filter's modules in order, sorted by their inputs.
 
     Attributes:
         initial: the initial belief.
-        frames: modules that read frames alone, and not the belief.
+        frames: modules that read frames, and not the belief.
         transition: the module that forecasts the carry: the first that depends on the belief.
-        update: the modules between the forecast and the belief, and those that depend on the action alone.
-        posterior: the same, and the ceiling of variances.
-        needed: keys that must be there in addition to the carry and the controls.
-        must: all keys without which there is no step.
-        optional: keys that are used where they are there.
+        update: the modules between the forecast and the belief, and those that depend only on the action.
+        posterior: ``update``, then the ceiling of variances.
+        needed: required keys in addition to the carry and the controls.
+        must: all required keys of a step.
+        optional: optional keys.
         controls: keys that drive the transition.
-        required_controls: those of them that must be there.
-        carry: keys of the belief that go on from step to step.
-        carried: the same, each with the kind of belief that knows what finite means there; ``None`` for all others.
-        belief: keys of the belief; the carry, and what follows from it.
-        forecast_of: the forecast of each carried entry, as far as the transition writes one.
-        beside: what else the transition writes.
-        readings: raw entries that the analyses' readings are made of.
-        own_info: new names for diagnostics that several analyses would write under one.
-        totals: sums of those over the analyses.
-        space: in which the state lives; ``None`` for plain numbers.
-        kinds: of the belief, one for each prefix.
+        required_controls: the required ones of them.
+        carry: keys of the belief that continue from step to step.
+        carried: the same, each with the kind of belief that has its own test for finite values, or ``None``.
+        belief: keys of the belief: the carry, and entries computed from it.
+        forecast_of: the forecast of each carried entry, if the transition writes one.
+        beside: other outputs of the transition.
+        readings: raw entries from which the analyses' readings are computed.
+        own_info: new names for diagnostics that several analyses would write under the same key.
+        totals: sums of these diagnostics over the analyses.
+        space: space of the state; ``None`` for plain numbers.
+        kinds: kinds of the belief, one for each prefix.
         likelihoods: the log-likelihood of each analysis' reading.
-        frame_keys: what the frame modules write.
-        step_keys: what transition and update write.
+        frame_keys: outputs of the frame modules.
+        step_keys: outputs of transition and update.
     """
 
     initial: TensorDictModuleBase
@@ -94,18 +94,18 @@ class Structure(NamedTuple):
         return (*self.frames, self.transition, *self.update)
 
     def in_keys(self, init_key: NestedKey) -> list[NestedKey]:
-        """Returns all that a filter reads: also stored beliefs, those of a policy, and what marks a beginning."""
+        """Returns all inputs of a filter, including stored beliefs, inputs in a policy, and the marks of resets."""
         keys = [*self.needed, *self.controls, *self.carry, *map(previous_key, self.carry), HAS_PREVIOUS]
         keys += [*map(previous_key, self.controls), *self.belief, init_key, *self.optional]
         return list(dict.fromkeys(keys))
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """Returns all that a filter writes."""
+        """Returns all outputs of a filter."""
         return [*self.frame_keys, *self.step_keys]
 
     def completed(self, entries: Entries, stored: Entries | None = None) -> Entries:
-        """Returns entries of a belief with those that follow from them, see :func:`torch_denkf.beliefs.complete`."""
+        """Returns a belief with the entries computed from its carry, see :func:`torch_denkf.beliefs.complete`."""
         lacking = any(key not in entries for key in self.belief)
         further = role(self.initial, Initial).derived({**(stored or {}), **entries}) if lacking else {}
         return complete({**further, **entries}, self.belief, self.kinds, stored)
@@ -121,15 +121,15 @@ class Structure(NamedTuple):
         """Sorts modules.
 
         Raises:
-            ValueError: if no module depends on the initial belief, one module would undo another, or it is not clear
-                what the forecast is.
+            ValueError: if no module depends on the initial belief, one module would overwrite another, or the forecast
+                is ambiguous.
         """
         provided = [unravel_key(key) for key in initial.out_keys]
         needed, optional = reads_of(module for _, module in modules)
         carry = [key for key in (*needed, *optional) if key in provided]
         if not carry:
             raise ValueError(
-                f"No module of the filter reads what its initial belief writes ({provided}); the filter reads "
+                f"No module of the filter reads an output of its initial belief ({provided}); the filter reads "
                 f"{needed}. Give both the same keys."
             )
         frames, steps = _sorted(modules, carry, control_keys)
@@ -141,7 +141,7 @@ class Structure(NamedTuple):
         still = [key for key in carry if key not in step_keys]
         if still:
             raise ValueError(
-                f"The belief holds {still}, which no module writes: a step would lose it. Let one pass it on."
+                f"The belief has {still}, which no module writes, so that a step would lose it. Let a module write it."
             )
         belief = list(dict.fromkeys([*(key for key in provided if key in step_keys), *summary_keys(carry, step_keys)]))
         space = role(initial, Initial).space
@@ -183,10 +183,10 @@ def _judge_of(key: NestedKey, kinds: Sequence[Belief]) -> Belief | None:
 def _sorted(
     modules: Sequence[Placed], carry: Sequence[NestedKey], controls: Sequence[NestedKey]
 ) -> tuple[list[Placed], list[Placed]]:
-    """Returns the modules that read frames alone; and the others, the transition first.
+    """Returns the modules that read only frames; and the others, the transition first.
 
-    A module that depends on the action and not on the belief, such as a reading's noise, runs behind the transition. So
-    does one that carries entries of its own alone, such as a count.
+    A module that depends on the action and not on the belief, such as a reading's noise, runs after the transition. So
+    does a module that only carries its own entries, such as a count.
     """
     frames: list[Placed] = []
     driven: list[Placed] = []
@@ -204,7 +204,7 @@ def _sorted(
             on_action.update(writes(module))
         else:
             frames.append((place, module))
-    if not steps:  # the first that reads the belief forecasts it, and writes over it
+    if not steps:  # the first that reads the belief forecasts it, in place
         first = next(
             index for index, (_, module) in enumerate(driven) if not {*carry}.isdisjoint(chain(*reads(module)))
         )
@@ -213,8 +213,8 @@ def _sorted(
     for key in chain(*reads(steps[0][1])):
         if key in made:
             raise ValueError(
-                f"{steps[0][0]!r} forecasts the belief and reads {key!r}, which {made[key]!r} makes of the action "
-                "alone. Let the transition read the action itself, or put both into one module."
+                f"{steps[0][0]!r} forecasts the belief and reads {key!r}, which {made[key]!r} computes from the action "
+                "only. Let the transition read the action itself, or put both into one module."
             )
     return frames, [*steps[:1], *driven, *steps[1:]]
 
@@ -222,12 +222,12 @@ def _sorted(
 def _forecasts(
     carry: Sequence[NestedKey], written: Sequence[NestedKey], chosen: Mapping[NestedKey, NestedKey]
 ) -> dict[NestedKey, NestedKey]:
-    """Maps each carried entry to its forecast, the entry of the same last name that the transition writes."""
+    """Maps each carried entry to its forecast, the output of the transition with the same last name."""
     chosen = {unravel_key(key): unravel_key(value) for key, value in chosen.items()}
     unknown = [key for key in chosen if key not in carry] + [key for key in chosen.values() if key not in written]
     if unknown:
         raise ValueError(
-            f"forecast_keys names {unknown}; the filter carries {list(carry)}, and {list(written)} is written."
+            f"forecast_keys has {unknown}; it carries {list(carry)}, the transition writes {list(written)}."
         )
     found = {}
     for key in carry:
@@ -238,32 +238,30 @@ def _forecasts(
         elif len(same) == 1:
             found[key] = same[0]
         elif len(same) > 1:
-            raise ValueError(
-                f"The transition writes {same}; say which is the forecast: forecast_keys={{{key!r}: ...}}."
-            )
+            raise ValueError(f"The transition writes {same}; select the forecast: forecast_keys={{{key!r}: ...}}.")
     if not found:
         if len(carry) > 1 or len(written) > 1:
             raise ValueError(
                 f"The first module that reads the belief, {list(carry)}, writes {list(written)}, of which none is a "
-                "forecast by its name. Say which is: forecast_keys={carried: forecast}."
+                "forecast by its name. Select it: forecast_keys={carried: forecast}."
             )
         found[carry[0]] = written[0]
     return found
 
 
 def _check_forecasts(forecast_of: Mapping[NestedKey, NestedKey], kinds: Sequence[Belief]) -> None:
-    """Raises where the transition forecasts some entries of a belief and it is not clear what forecasts the others."""
+    """Raises if the transition forecasts some entries of a belief and the forecasts of the others are ambiguous."""
     for kind in kinds:
         lacking = [key for key in kind.carry if key not in forecast_of]
         if lacking and len(lacking) < len(kind.carry):
             raise ValueError(
-                f"The transition writes no forecast of {lacking} under the same last name: say which entry it is, "
+                f"The transition writes no forecast of {lacking} under the same last name: select the entry, "
                 f"forecast_keys={{{lacking[0]!r}: ...}}."
             )
 
 
 def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequence[NestedKey]) -> list[NestedKey]:
-    """Returns the entries from outside of which the analyses' readings are made, through whatever sensors."""
+    """Returns the external entries from which the analyses' readings are computed, through any sensors."""
     found: dict[NestedKey, None] = {}
     for _, module in update:
         for part in in_role(module, Update):
@@ -276,7 +274,7 @@ def _readings(frames: Sequence[Placed], update: Sequence[Placed], needed: Sequen
 
 
 def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey]], dict]:
-    """Names of their own for the diagnostics of several analyses, and what to sum up."""
+    """Returns distinct names for the diagnostics of several analyses, and the entries to sum."""
     writers: dict[str, list[Placed]] = {}
     for place, module in steps:
         for part in in_sequences(module):
@@ -303,7 +301,7 @@ def _apart(steps: Sequence[Placed]) -> tuple[dict[str, dict[NestedKey, NestedKey
 
 
 def _likelihoods(steps: Sequence[Placed], own_info: Mapping, totals: Mapping) -> list[NestedKey]:
-    """Returns the log-likelihoods that together are that of all readings."""
+    """Returns the log-likelihoods whose sum is that of all readings."""
     found = []
     for place, module in steps:
         for part in in_sequences(module):

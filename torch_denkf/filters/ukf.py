@@ -1,4 +1,4 @@
-"""The differentiable unscented Kalman filter: the same sub-models as an ensemble filter's, on sigma points."""
+"""The differentiable unscented Kalman filter, with the sub-models of an ensemble filter on sigma points."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ class UKF(Filter):
     """Unscented Kalman filter whose transition, sensor, observation and noise models may all be learned (dUKF).
 
     It takes the modules of :class:`~torch_denkf.filters.DEnKF` and a process noise, and has the belief of
-    :class:`~torch_denkf.filters.EKF`. 2 S + 1 sigma points go through the transition as an ensemble, and fresh ones
+    :class:`~torch_denkf.filters.EKF`. 2 S + 1 sigma points pass through the transition as an ensemble, and new ones
     through the observation model.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``; its stochastic networks run their deterministic forward.
-        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` where the
+        sensor: writes ``("sensor", "ensemble")`` ``[*B, E, O]``, whose mean is the reading; ``None`` if the
             reading is in the tensordict, under ``observation_key``.
         observation: observes ensembles, writes ``("forecast", "observation")``.
         noise: R, writes ``("sensor", "noise")``: variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
-        process_noise: Q: standard deviations ``[S]`` (a number for all, 0 for none), or a module that writes it, see
+        process_noise: Q: standard deviations ``[S]`` (one number for all, 0 for none), or a module that writes it, see
             :mod:`torch_denkf.modules.process_noise`.
         initial: the initial belief, :class:`~torch_denkf.modules.MomentPrior` or
             :class:`~torch_denkf.modules.GaussianAround`; its covariance may be singular.
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
-        kappa: their secondary spread. Covariances stay positive where no weight is negative, as by default.
-        inflation: factor on the belief's standard deviations, where anything is observed. What is never observed grows
-            by it without bound.
-        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility``, ``sensor_error`` and what
-            every filter takes, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
+        kappa: second scaling parameter of the spread. Covariances stay positive if no weight is negative, the default.
+        inflation: factor of the belief's standard deviations where anything is observed. Components that are never
+            observed grow by it without bound.
+        **options: ``reading_space``, ``observation_key``, ``observed_key``, ``visibility``, ``sensor_error`` and the
+            common options of filters, see :class:`~torch_denkf.filters.parts.ReadingOptions`.
 
     Raises:
-        ValueError: if it is not clear where the reading is, or ``initial`` writes no mean and covariance.
+        ValueError: if the source of the reading is ambiguous, or ``initial`` writes no mean and covariance.
 
     Reference:
         Kloss, Martius, Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313, section 3.

@@ -1,8 +1,8 @@
 """The analysis in ensemble space: one E x E system, and for large states two passes over tiles of columns.
 
-A whole state of 10⁶ components and 32 members is 128 MB; the dozen arrays of that size that a plain formula leaves on
-its way cost more time, in fresh pages and cache misses, than the arithmetic. In tiles that stay in the cache only the
-result is as large as the ensemble.
+A whole state of 10⁶ components and 32 members is 128 MB; the dozen intermediate arrays of that size in a plain formula
+cost more time, in fresh pages and cache misses, than the arithmetic. With tiles that fit in the cache only the result
+is as large as the ensemble.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from torch_denkf.functional._whitened import Whitened, scores, shift, whiten
 from torch_denkf.functional.kernels.small_system import on_gpu
 from torch_denkf.functional.linalg import Solver, inverse_square_root
 
-#: Elements of an ensemble in one tile: 256 KiB in single precision, which a core's own cache holds several times.
+#: Elements of an ensemble in one tile: 256 KiB in single precision, several of which fit in a core's own cache.
 TILE_ELEMENTS = 2**16
-#: The same on a GPU: 1 GiB in single precision; the plain formula holds a dozen arrays of the ensemble's size.
+#: The same on a GPU: 1 GiB in single precision; the plain formula has a dozen arrays of the ensemble's size.
 GPU_TILE_ELEMENTS = 2**28
 
 
 def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> tuple[Tensor, Tensor | None, Tensor]:
     """Solves with I + YYᵀ, E x E.
 
-    YYᵀ maps the vector of ones to zero, and what is solved for is orthogonal to it. So its eigenvalue is
-    free: at the mean of the diagonal, c, the matrix keeps its digits when R is tiny.
+    YYᵀ maps the vector of ones to zero, and the solution is orthogonal to that vector. So the eigenvalue of the vector
+    of ones can be chosen: at the mean of the diagonal, c, the matrix keeps its digits when R is tiny.
 
     Args:
         gram: YYᵀ, ``[*B, E, E]``; the members' anomalies sum to zero.
@@ -52,11 +52,11 @@ def solve_ensemble_space(gram: Tensor, right: Tensor, *, square_root: bool) -> t
 
 
 def columns_in_a_tile(forecast: Tensor, *others: Tensor | None) -> int | None:
-    """Returns how many components :func:`analyse_in_tiles` takes at a time, ``None`` where it is not to be used.
+    """Returns how many components :func:`analyse_in_tiles` takes at a time, ``None`` if tiles should not be used.
 
-    Where everything fits in two tiles nothing is gained; a graph for gradients keeps all it saw, in tiles or not;
-    a compiler would unroll the loop over tiles and fuses the plain formulas itself. A GPU has no such cache: tiles are
-    of :data:`GPU_TILE_ELEMENTS` there, for its memory.
+    Tiles gain nothing if everything fits in two of them, or if gradients are needed, as the graph keeps all
+    intermediate results. A compiler would unroll the loop over tiles, and fuses the plain formulas itself. A GPU has
+    no such cache: its tiles have :data:`GPU_TILE_ELEMENTS`, to limit memory.
     """
     columns = (GPU_TILE_ELEMENTS if on_gpu(forecast) else TILE_ELEMENTS) // max(forecast[..., 0].numel(), 1)
     widest = max(tensor.shape[-1] for tensor in (forecast, *others) if tensor is not None)
@@ -82,11 +82,11 @@ def analyse_in_tiles(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Computes :func:`~torch_denkf.functional.analyse` in ensemble space, without gradients, in little memory.
 
-    Besides the arguments and the result it holds a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices
-    ``[*B, E, E]``. Arguments and results are those of ``analyse``, checked there.
+    Its temporary memory is a few tiles ``[*B, E, columns]``, rows ``[*B, O]`` and matrices ``[*B, E, E]``. Arguments
+    and results are those of ``analyse``, checked there.
 
-    With ``total`` the columns are a share of all there are, and it adds up sums over columns with those of the other
-    shares: it takes and returns them as tensors ``[*B, ...]``.
+    With ``total`` the columns are one share of all columns: ``total`` takes sums over these columns as tensors
+    ``[*B, ...]``, and returns the sums over all shares.
     """
     samples = observation if observation.ndim == forecast.ndim else observation.unsqueeze(-2)
     mask = None if observed is None else observed.expand(noise.shape)
@@ -123,7 +123,7 @@ def analyse_in_tiles(
     for start in range(0, 0 if total is not None else dim, columns):
         reading = tile(start)[-1]
         least = least + (reading.mean_shift - mean_weights @ reading.normalised).square().sum(-1)
-    if total is not None:  # the same as a difference, which needs no second sum over all shares
+    if total is not None:  # equal, as a difference, without a second sum over all shares
         explained = mean_weights.double() @ right.double().mean(-1, keepdim=True)
         least = (square - explained.squeeze(-1)).to(forecast.dtype)
 

@@ -1,4 +1,4 @@
-"""Innovations and anomalies that the gain of the ensemble update acts on, in units of the reading's noise."""
+"""Innovations and anomalies for the gain of the ensemble update, in units of the reading's noise."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor
 
 
 class Whitened(NamedTuple):
-    """A reading and what the members predict of it; components that are not observed have innovation 0, variance 1.
+    """A whitened reading and the members' predictions; missing components have innovation 0 and variance 1.
 
     Attributes:
         predicted: HX, ``[*B, E, O]``.
         samples: ỹ, ``[*B, E, O]``, or one for all members, ``[*B, 1, O]``.
         noise: the variances R, ``[*B, O]``.
-        innovation: of the means, ``[*B, 1, O]``.
-        scale: R^-1/2 / √(E − 1), ``[*B, 1, O]``, the factor of what follows.
+        innovation: innovation of the means, ``[*B, 1, O]``.
+        scale: R^-1/2 / √(E − 1), ``[*B, 1, O]``, the factor of the two below.
         normalised: Y, the anomalies of the predictions, ``[*B, E, O]``.
         mean_shift: the innovation, ``[*B, 1, O]``.
     """
@@ -32,7 +32,7 @@ class Whitened(NamedTuple):
 
 
 def whiten(predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor | None) -> Whitened:
-    """Returns the reading's components, all or some of them, in units of their noise.
+    """Divides all or some of the reading's components by their noise.
 
     Args:
         predicted: HX, ``[*B, E, O]``.
@@ -52,7 +52,7 @@ def whiten(predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor |
 
 
 def shift(scheme: str, reading: Whitened, observed: Tensor | None, perturbation: Tensor | None) -> Tensor:
-    """Returns the innovations that the gain acts on, one row a member, or one for all (``"etkf"``)."""
+    """Returns the innovations that the gain acts on, one row per member, or one row for all (``"etkf"``)."""
     if scheme == "sensor":
         return (reading.samples - reading.predicted) * reading.scale  # Ỹ − HX, eq. 12
     if scheme == "sakov":
@@ -72,9 +72,9 @@ def scores(square: Tensor, log_det: Tensor, log_noise: Tensor, count: int | Tens
 
     Args:
         square: mean_shift (I + YᵀY)⁻¹ mean_shiftᵀ.
-        log_det: of I + YᵀY.
-        log_noise: of R.
-        count: of observed components.
+        log_det: log-determinant of I + YᵀY.
+        log_noise: log-determinant of R.
+        count: number of observed components.
         size: E.
     """
     nis = square * (size - 1)

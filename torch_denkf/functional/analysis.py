@@ -79,9 +79,9 @@ def analyse(
             of dimensions), in the sensor's units.
         noise: variances R, ``[*B, O]``, positive, in the sensor's units squared.
         scheme: one of the four above.
-        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; False takes that component out of the update, and
-            its observation and noise may then be anything, NaN too. Where nothing is observed the
-            ensemble comes back as it went in. None: everything is observed.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; components with False are left out of the update, whatever the
+            values of their observation and noise, NaN included. An ensemble with no observed component is returned
+            unchanged. None: everything is observed.
         perturbation: standard normal draws for ``"perturbed"``, ``[*B, E, O]``; they are centred over the
             members and rescaled by sqrt(E / (E − 1)), which keeps their variance. None: drawn here.
         rotation: orthogonal matrices that keep the vector of ones, ``[*B, E, E]``, applied to the
@@ -89,23 +89,23 @@ def analyse(
         taper: localisation: factors in [0, 1] on the sample covariances of state and predicted observation
             ``[*B, S, O]`` and of the predicted observations ``[*B, O, O]``, before anything is solved (Houtekamer
             & Mitchell 2001). Batch dimensions may be left out. Not for ``"etkf"``; needs observation space.
-        significance: localisation by what the members themselves say, see :func:`significant`: how many standard
-            deviations a sample correlation must be away from zero to be used, such as 3. ``None`` uses all. The
-            components of the reading are then taken in one after the other, each with the correlations that the one
-            before left (Whitaker & Hamill 2002; Anderson 2003). Needs observation space.
+        significance: localisation by sample correlations, see :func:`significant`: the number of standard deviations,
+            such as 3, that a sample correlation must be away from zero to be used. ``None`` uses all. The
+            components of the reading are then assimilated one after the other, each with the correlations after the
+            update before it (Whitaker & Hamill 2002; Anderson 2003). Needs observation space.
         space: where to solve: ``"observation"`` costs O(O³ + O E S), ``"ensemble"`` O(E³ + E² (S + O));
             ``"auto"`` takes observation space if O < E: the smaller system is also the accurate one. Without
-            gradients, ensemble space takes large states in tiles: memory is the result's and a few tiles.
+            gradients, ensemble space processes large states in tiles: it needs memory for the result and a few tiles.
 
     Returns:
-        An :class:`Analysis`; all NaN for those batch elements whose system is not positive definite.
+        An :class:`Analysis`; all NaN for batch elements whose system is not positive definite.
 
     Raises:
         ValueError: for shapes that do not fit, an unknown scheme or space, ``"sensor"`` without samples,
-            or a perturbation, rotation or taper given to a scheme or a space that has no use for it.
+            or a perturbation, rotation or taper for a scheme or a space that does not use it.
 
     Examples:
-        Two members at -1 and 1, seen directly with variance 2, as much as their own: half-way.
+        Two members at -1 and 1, observed directly with variance 2, equal to their own: the update goes half-way.
 
         >>> import torch
         >>> ensemble = torch.tensor([[-1.0], [1.0]])
@@ -131,7 +131,7 @@ def analyse(
     mean = forecast.mean(-2, keepdim=True)
     anomalies = forecast - mean  # A, eq. 10
     acted_on = shift(scheme, reading, observed, perturbation)
-    # Both spaces solve with S, eq. 9, in units of the noise; the increment is K, eq. 11, times what it acts on.
+    # Both spaces solve with S, eq. 9, in units of the noise; the increment is K, eq. 11, times the innovations.
     if significance is not None:
         believed = partial(_one_after_the_other, scheme=scheme, taper=taper, significance=significance)
         increment, root, square, log_det = believed(reading, anomalies, acted_on)
@@ -153,7 +153,7 @@ def analyse(
 def _in_few_launches(
     forecast: Tensor, predicted: Tensor, samples: Tensor, noise: Tensor, observed: Tensor | None
 ) -> Analysis:
-    """Updates by samples of the reading, for a GPU: one mean, one difference and one product of all there is."""
+    """Updates with samples of the reading, for a GPU: one mean, one difference and one product for all entries."""
     size, dim = predicted.shape[-2:]
     count: int | Tensor = dim
     if observed is not None:
@@ -192,7 +192,7 @@ def check_analysis_arguments(
     check_choice("space", space, get_args(Space))
     if scheme == "sensor" and observation.ndim != forecast.ndim:
         raise ValueError(
-            f"scheme 'sensor' needs one observation a member, [*B, E, O], got {list(observation.shape)}; "
+            f"scheme 'sensor' needs one observation per member, [*B, E, O], got {list(observation.shape)}; "
             "use 'perturbed', 'etkf' or 'sakov' for a single observation"
         )
     if observed is not None:
@@ -272,20 +272,20 @@ def _one_after_the_other(
     taper: tuple[Tensor, Tensor] | None,
     significance: float | Tensor,
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Takes in the components of the reading in their order, each as far as correlations with it are significant.
+    """Assimilates the components of the reading one after the other, with their significant correlations only.
 
-    A component by itself needs no matrix, and no product of factors with a matrix, which might not be positive
-    definite. What the members predict of the components behind it is moved like the state.
+    A single component needs no matrix, and no product of factors with a matrix, which might not be positive definite.
+    The predictions of later components are updated like the state.
 
     Returns:
-        As :func:`_observation_space`. Members' anomalies are those of all schemes but the stochastic ones.
+        As :func:`_observation_space`; anomalies of the members for all but the stochastic schemes.
     """
     dim, threshold = anomalies.shape[-1], significance
-    if isinstance(threshold, Tensor) and threshold.ndim:  # [S]: a reading is as strict as they are on average
+    if isinstance(threshold, Tensor) and threshold.ndim:  # [S]: predicted readings use their mean
         threshold = torch.cat([threshold, threshold.mean().expand(reading.normalised.shape[-1])])
     deterministic = scheme in ("etkf", "sakov")
     acted_on = reading.mean_shift if deterministic else acted_on
-    whole = torch.cat([anomalies, reading.normalised], -1)  # the state, and the reading that is predicted of it
+    whole = torch.cat([anomalies, reading.normalised], -1)  # the state and its predicted reading
     moved = torch.zeros_like(acted_on[..., :1])
     square = log_det = torch.zeros_like(reading.mean_shift[..., 0])
     for number in range(reading.normalised.shape[-1]):
@@ -308,7 +308,7 @@ def _one_after_the_other(
 
 
 def check_significance(threshold: float | Tensor | None, size: int) -> None:
-    """Raises a ``ValueError`` where no correlation that E members can show is significant."""
+    """Raises a ``ValueError`` if no correlation of E members can be significant."""
     if threshold is not None and not isinstance(threshold, Tensor) and threshold**2 >= size - 1:
         raise ValueError(
             f"With {size} members no correlation is {threshold:g} standard deviations away from chance: the largest is "
@@ -319,30 +319,30 @@ def check_significance(threshold: float | Tensor | None, size: int) -> None:
 def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: float | Tensor) -> Tensor:
     r"""Computes the localisation factor of sample covariances by significance, :math:`\max(0, 1 - (z_0 / z)^2)`.
 
-    The correlation r of two components of E members that have nothing to do with each other is not zero: its standard
-    deviation is :math:`1 / \sqrt{E - 1}`. So :math:`z = |r| \sqrt{E - 1}` says how significant r is. Each update
-    multiplies a gain by this factor, and what chance alone explains moves nothing. With fast sensors, thousands of such
-    updates would otherwise shrink what the readings say nothing about. Members enough, and the factor is 1.
+    The sample correlation r of two independent components of E members is not zero: its standard deviation is
+    :math:`1 / \sqrt{E - 1}`. So :math:`z = |r| \sqrt{E - 1}` measures the significance of r. Each update multiplies
+    a gain by this factor, so that correlations by chance have no effect. With fast sensors, thousands of such updates
+    would otherwise shrink components about which the readings have no information. With many members the factor is 1.
 
     Correlation-based localisation: Anderson, Monthly Weather Review 140, 2012; Luo & Bhakta, Computational Geosciences
     24, 2020; Vishny, Morzfeld, Gwirtz, Bach, Dunbar & Hodyss, JAMES 16, 2024. This factor is smooth.
 
     Gradients reach the threshold, which may be trained, and not the anomalies: for them the factor is a constant, as a
-    taper is. Near the threshold its slope is steepest, and correlations are of chance: the training of a filter of 64
-    members of a robot arm through it diverged. So of several readings the threshold's gradient leaves out how
-    the first ones change the correlations that the later ones see.
+    taper is. Near the threshold, where correlations are due to chance, its slope is steepest: training a filter of a
+    robot arm with 64 members with these gradients diverged. So with several readings the threshold's gradient ignores
+    how the first ones change the correlations for the later ones.
 
     Args:
         cross: products of the anomalies, ``[*B, O, S]``.
         predicted: anomalies of the predicted observations, ``[*B, E, O]``, in any unit.
         state: anomalies of the state, ``[*B, E, S]``.
-        threshold: :math:`z_0`, positive, one number or ``[S]``; below :math:`\sqrt{E - 1}`, or nothing is used.
+        threshold: :math:`z_0`, positive, one number or ``[S]``, below :math:`\sqrt{E - 1}`, the largest z.
 
     Returns:
         Factors in [0, 1), ``[*B, O, S]``.
 
     Example:
-        >>> anomalies = torch.tensor([[-1.0, 1.0], [0.0, -2.0], [1.0, 1.0]])  # the second knows nothing of the first
+        >>> anomalies = torch.tensor([[-1.0, 1.0], [0.0, -2.0], [1.0, 1.0]])  # two uncorrelated components
         >>> significant(anomalies[:, :1].mT @ anomalies, anomalies[:, :1], anomalies, 1.0)
         tensor([[0.5000, 0.0000]])
     """
@@ -350,14 +350,14 @@ def significant(cross: Tensor, predicted: Tensor, state: Tensor, threshold: floa
     spread = predicted.square().sum(-2).unsqueeze(-1) * state.square().sum(-2, keepdim=True)
     limit = threshold**2 * spread / (state.shape[-2] - 1)
     explained = cross.square()
-    chance = explained <= limit  # a threshold that is NaN stays seen
+    chance = explained <= limit  # False for a NaN threshold, which reaches the result
     return torch.where(chance, 0, 1 - limit / torch.where(chance, 1, explained))
 
 
 def _ensemble_space(
     reading: Whitened, anomalies: Tensor, acted_on: Tensor, *, square_root: bool
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Solves with I + YYᵀ, E x E; what it returns equals :func:`_observation_space`'s."""
+    """Solves with I + YYᵀ, E x E; the results equal those of :func:`_observation_space`."""
     y = reading.normalised
     weights, root, log_det = solve_ensemble_space(y @ y.mT, y @ acted_on.mT, square_root=square_root)
     mean_weights = weights.mean(-2, keepdim=True)

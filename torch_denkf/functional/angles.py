@@ -1,4 +1,4 @@
-"""Angles in radians, of which many values mean the same direction."""
+"""Wraps angles in radians to one turn."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from torch import Tensor
 
 
 def wrap_angles(values: Tensor) -> Tensor:
-    """Brings angles to [-pi, pi).
+    """Wraps angles to [-pi, pi).
 
     Args:
-        values: angles in radians, of any shape. Of numbers of which some are angles, see
+        values: angles in radians, of any shape. For vectors in which only some components are angles, see
             :class:`~torch_denkf.functional.manifolds.Flat`.
 
     Returns:

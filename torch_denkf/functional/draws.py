@@ -1,4 +1,4 @@
-"""Standard-normal draws of an ensemble whose sample has the moments that the distribution has."""
+"""Standard-normal draws of an ensemble whose sample moments equal those of the distribution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["exact_draws", "is_exact"]
 
 
 def is_exact(draws: str) -> bool:
-    """Tells whether draws are to be exact.
+    """Tells whether ``draws`` selects exact draws.
 
     Raises:
         ValueError: if ``draws`` is neither ``"exact"`` nor ``"random"``.
@@ -24,18 +24,18 @@ def is_exact(draws: str) -> bool:
 def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     """Makes normal draws exact to second order: mean 0, sample covariance I, uncorrelated with the members.
 
-    Random draws of E members have a mean, a covariance, and correlations with the members by chance, each of size
-    1 / sqrt(E). An ensemble that adds them up in each step is far from what its Q says. Exact draws do not; for a
-    linear Gaussian system such an ensemble is the Kalman filter.
+    Random draws of E members have by chance a mean, a covariance error, and correlations with the members, each of
+    size 1 / sqrt(E). In an ensemble that adds them in each step, these errors accumulate, and its spread departs from
+    Q. Exact draws have no such errors; for a linear Gaussian system such an ensemble is the Kalman filter.
 
-    For all three E must be at least S + 9/8 q + 3. With fewer members mean and covariance are exact, and the draws
-    uncorrelated with as many directions of the members as there is room for; with fewer than 9/8 q + 3 the mean
-    alone is: q draws in little more than q dimensions are nearly dependent, and whitening them would magnify rounding.
+    All three properties need E of at least S + 9/8 q + 3. With fewer members mean and covariance are exact, and the
+    draws are uncorrelated with as many directions of the members as possible; below 9/8 q + 3 only the mean is exact:
+    q draws in little more than q dimensions are nearly dependent, and whitening them would magnify rounding.
 
     Args:
         normal: standard-normal draws, ``[*B, E, q]``.
-        *uncorrelated: members, ``[*B, E, S]`` each, that the draws are to be uncorrelated with. Where there is no room
-            for all, those that come first have it.
+        *uncorrelated: members, ``[*B, E, S]`` each, with which the draws shall be uncorrelated. If E is too small
+            for all, the first argument takes precedence.
 
     Returns:
         Draws ``[*B, E, q]``; zero where ``normal`` has no spread.
@@ -59,7 +59,7 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
     if uncorrelated and room:
         away, *others = map(_anomalies, uncorrelated)
         if away.shape[-1] > room:
-            # Columns that lean towards what the anomalies vary most in, whatever their units.
+            # Combinations of the columns along the largest variations of the anomalies, whatever their units.
             square = away.square().sum(-2, keepdim=True)
             away = (away @ (away / torch.where(square > 0, square, 1)).mT)[..., :room]
         for more in others:
@@ -71,7 +71,7 @@ def exact_draws(normal: Tensor, *uncorrelated: Tensor) -> Tensor:
 
 
 def _anomalies(members: Tensor) -> Tensor:
-    """Returns the deviations from the mean, at most 1: their squares neither vanish nor overflow, nor do gradients."""
+    """Returns the deviations from the mean, scaled to at most 1, so that squares neither vanish nor overflow."""
     away = members - members.mean(-2, keepdim=True)
     scale = away.detach().abs().amax(-2, keepdim=True)
     return away * torch.where(scale > torch.finfo(away.dtype).tiny, 1 / scale, 0)

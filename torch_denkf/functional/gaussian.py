@@ -1,4 +1,4 @@
-"""The Kalman filter's two steps on a mean and a covariance: the oracle of the ensemble filters, and the
+"""The Kalman filter's two steps on a mean and a covariance: the reference of the ensemble filters, and the
 linear algebra of the extended Kalman filter, whose matrices are Jacobians.
 """
 
@@ -81,7 +81,7 @@ def kalman_update(
 ) -> GaussianUpdate:
     """Conditions a Gaussian on a linear observation (Särkkä 2013, eq. 4.21).
 
-    The covariance in Joseph's form, (I − KH) P (I − KH)ᵀ + K R Kᵀ, which round-off leaves positive. For an
+    The covariance has Joseph's form, (I − KH) P (I − KH)ᵀ + K R Kᵀ, which stays positive under round-off. For an
     extended Kalman filter pass H = the Jacobian of h at the mean and ``observation - h(mean) + H @ mean``.
 
     Args:
@@ -90,11 +90,11 @@ def kalman_update(
         observation: y, ``[*B, O]``, in the sensor's units.
         observation_matrix: H, ``[O, S]`` or ``[*B, O, S]``.
         noise: R: variances, ``[*B, O]``, or covariances, ``[*B, O, O]``.
-        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; False takes that component out of the update, and
-            its observation and noise may then be anything, NaN too. None: everything is observed.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; components with False are left out of the update, whatever the
+            values of their observation and noise, NaN included. None: everything is observed.
 
     Returns:
-        A :class:`GaussianUpdate`; all NaN for those batch elements whose S is not positive definite, or with a
+        A :class:`GaussianUpdate`; all NaN for batch elements whose S is not positive definite, or that have a
             negative variance in R.
 
     Raises:
@@ -116,9 +116,9 @@ def kalman_update(
 def innovation_update(
     cov: Tensor, innovation: Tensor, observation_matrix: Tensor, noise: Tensor, *, observed: Tensor | None = None
 ) -> GaussianUpdate:
-    """Does what :func:`kalman_update` does for a prior mean of zero; of what it takes the mask alone is checked.
+    """Updates like :func:`kalman_update`, for a prior mean of zero; checks the mask only.
 
-    In deviations from the mean H m costs no digits where the state is far from zero.
+    In deviations from the mean, H m loses no digits for states far from zero.
     """
     batch, dim = innovation.shape[:-1], innovation.shape[-1]
     if noise.ndim == innovation.ndim:
@@ -131,7 +131,7 @@ def innovation_update(
         observation_matrix = torch.where(observed.unsqueeze(-1), observation_matrix, 0)
 
     p, h, r = cov, observation_matrix.expand(*batch, dim, cov.shape[-1]), innovation
-    if len(batch) != 1:  # a product of batches with one dimension costs a third of any other
+    if len(batch) != 1:  # bmm with one batch dimension takes a third of the time
         p, h, noise = [value.reshape(-1, *value.shape[-2:]) for value in (p, h, noise.expand(*batch, dim, dim))]
         r = innovation.reshape(-1, dim)
     cross = torch.bmm(h, p)
@@ -147,7 +147,7 @@ def innovation_update(
 
 
 def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns a mask of each component, R ``[*B, O, O]`` with ones in the place of the others, and how many they are.
+    """Returns a mask of each component, R ``[*B, O, O]`` with the identity for unobserved ones, and the observed count.
 
     Args:
         observed: ``[*B, 1]`` or ``[*B, O]``.
@@ -165,7 +165,7 @@ def hide(observed: Tensor, noise: Tensor, shape: Sequence[int]) -> tuple[Tensor,
 
 
 def check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor, noise: Tensor) -> None:
-    """Raises where what :func:`kalman_update` takes does not fit."""
+    """Checks the arguments of :func:`kalman_update`."""
     batch, size, dim = mean.shape[:-1], mean.shape[-1:], observation.shape[-1:]
     noise_shape = (*batch, *dim) if noise.ndim == mean.ndim else (*batch, *dim, *dim)
     plain = mean.dtype == cov.dtype == observation.dtype == matrix.dtype == noise.dtype
@@ -183,9 +183,9 @@ def check_update(mean: Tensor, cov: Tensor, observation: Tensor, matrix: Tensor,
 
 
 def gaussian_log_prob(value: Tensor, mean: Tensor, cov: Tensor) -> Tensor:
-    """Returns the log-density of a Gaussian, log N(value; mean, cov), NaN where ``cov`` is not positive definite.
+    """Returns the log-density of a Gaussian, log N(value; mean, cov), NaN if ``cov`` is not positive definite.
 
-    Unlike ``torch.distributions.MultivariateNormal`` it never waits for the device.
+    Unlike ``torch.distributions.MultivariateNormal`` it never synchronises with the device.
 
     Args:
         value: ``[*B, S]``.
@@ -224,7 +224,7 @@ def sandwich(matrix: Tensor, cov: Tensor) -> Tensor:
 
 
 def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns the gain Cᵀ M⁻¹ with the residual's covariance M, and the two numbers of its likelihood.
+    """Returns the gain Cᵀ M⁻¹ with the residual's covariance M, and the two terms of its likelihood.
 
     Args:
         matrix: M, ``[*B, O, O]``.
@@ -232,7 +232,7 @@ def solve_for_gain(matrix: Tensor, cross: Tensor, residual: Tensor) -> tuple[Ten
         residual: r, ``[*B, O]``.
 
     Returns:
-        Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN where M is not positive definite.
+        Cᵀ M⁻¹, ``[*B, S, O]``; rᵀ M⁻¹ r and log det M, ``[*B, 1]`` each. NaN if M is not positive definite.
     """
     if matrix.shape[-1] == 1:
         total = torch.threshold(matrix, 0, torch.nan)
@@ -246,6 +246,6 @@ def _check_moments(mean: Tensor, cov: Tensor, noise: Tensor | None = None) -> No
     if mean.ndim < 1:
         raise ValueError("mean must be [*B, S], got a scalar; add the dimension with unsqueeze")
     check_shape("cov", cov, (*mean.shape, mean.shape[-1]), "[*B, S, S]")
-    # Noise is only added: one of lower precision will do.
+    # Noise is only added, so it may have a lower precision.
     if noise is not None and torch.promote_types(mean.dtype, noise.dtype) != mean.dtype:
         check_one_dtype(mean=mean, noise=noise)

@@ -1,4 +1,4 @@
-"""Keeping an ensemble's spread honest: inflation, relaxation to the forecast's spread, random rotation."""
+"""Corrections of an ensemble's spread: inflation, relaxation to the forecast's spread, random rotation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def inflate(ensemble: Tensor, factor: float | Tensor) -> Tensor:
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
-        factor: what the standard deviation is multiplied by (the variance by its square); a number or a
+        factor: factor of the standard deviation (the variance is multiplied by its square); a number or a
             tensor that broadcasts to ``[*B, E, S]``.
 
     Returns:
@@ -39,7 +39,7 @@ def relax_to_prior_spread(analysis: Tensor, forecast: Tensor, relaxation: float 
     """Relaxes the analysis to the prior spread (Whitaker & Hamill 2012, Mon. Wea. Rev. 140).
 
     Each component's anomalies are multiplied by 1 − α + α σ_f / σ_a, so that its standard deviation
-    becomes (1 − α) σ_a + α σ_f. A component without analysis spread stays as it is, with finite gradients.
+    becomes (1 − α) σ_a + α σ_f. A component without analysis spread is unchanged, with finite gradients.
 
     Args:
         analysis: the analysis ensemble, ``[*B, E, S]``, in the state's units.
@@ -76,16 +76,16 @@ def random_rotation(
 ) -> Tensor:
     """Draws random orthogonal matrices that keep the vector of ones, for the members of a square-root filter.
 
-    They change the members but neither their mean nor their covariance, and so undo the outliers that a
-    deterministic filter collects in nonlinear systems (Sakov & Oke 2008, Mon. Wea. Rev. 136). Uniform
-    (Haar) among all such matrices.
+    They change the members but neither their mean nor their covariance, and so remove the outliers that a
+    deterministic filter develops in nonlinear systems (Sakov & Oke 2008, Mon. Wea. Rev. 136). The distribution is
+    uniform (Haar) over all such matrices.
 
     Args:
         ensemble_size: E, at least 2.
         batch_shape: the leading dimensions, ``*B``.
-        generator: where to draw from; None: torch's default generator.
+        generator: source of randomness; None: torch's default generator.
         dtype: floating type of the result; None: torch's default.
-        device: where to make it; None: torch's default.
+        device: device of the result; None: torch's default.
 
     Returns:
         Ω, ``[*B, E, E]``, with Ω Ωᵀ = I and Ω 1 = 1.
@@ -124,9 +124,9 @@ def random_rotation(
 def _orthogonal(gaussian: Tensor) -> Tensor:
     """Makes uniform orthogonal matrices without a QR decomposition, which waits for a GPU.
 
-    Householder's reflections of independent vectors of one component less each (Stewart 1980, "The efficient generation
-    of random orthogonal matrices", SIAM J. Numer. Anal. 17): of the columns of the lower triangle. Their product is
-    I − V T Vᵀ, and the inverse of T is the upper triangle of VᵀV with its diagonal halved.
+    It multiplies Householder reflections of independent vectors, each one component shorter than the last (Stewart
+    1980, "The efficient generation of random orthogonal matrices", SIAM J. Numer. Anal. 17): the columns of the lower
+    triangle. The product is I − V T Vᵀ, and the inverse of T is the upper triangle of VᵀV with its diagonal halved.
     """
     columns = gaussian.tril()
     signs = gaussian.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2)

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 __all__ = ["jacobian_of_layers", "jacobian_of_network"]
 
 
-#: Derivatives of activations, from the layer, what it read and what it wrote.
+#: Derivatives of activations as functions of the layer, its input and its output.
 _SLOPES: dict[type, Callable[..., Tensor]] = {
     nn.ReLU: lambda layer, x, y: x > 0,
     nn.LeakyReLU: lambda layer, x, y: torch.where(x > 0, 1.0, torch.full_like(x, layer.negative_slope)),
@@ -25,19 +25,19 @@ _SLOPES: dict[type, Callable[..., Tensor]] = {
 
 
 def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tensor, Tensor] | None:
-    """Returns what a network makes of ``x``, and the Jacobian by its first numbers, where that is a product.
+    """Returns a network's output for ``x`` and its Jacobian by the first inputs, if that is a product of matrices.
 
-    Both can be differentiated. A network that has a method of its own, ``jacobian(x, size)``, is asked, unless a
-    subclass has a new ``forward`` and no new Jacobian.
+    Both can be differentiated. If a network has its own method ``jacobian(x, size)``, this is called, unless a
+    subclass overrides ``forward`` but not the Jacobian.
 
     Args:
         network: linear layers and activations, one after the other in ``nn.Sequential``.
         x: ``[*, N]``.
-        size: S, how many of the N numbers the Jacobian is by.
+        size: S, the number of inputs with respect to which the Jacobian is taken.
 
     Returns:
-        ``[*, M]`` and ``[*, M, S]``, or ``[M, S]`` if it is constant; ``None`` where another layer is among them, or a
-        layer has hooks.
+        ``[*, M]`` and ``[*, M, S]``, or ``[M, S]`` if it is constant; ``None`` if the network has another kind of
+        layer, or a layer has hooks.
 
     Example:
         >>> net = nn.Sequential(nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 1))
@@ -54,7 +54,7 @@ def jacobian_of_network(network: nn.Module, x: Tensor, size: int) -> tuple[Tenso
 def jacobian_of_layers(
     layers: Sequence[Any], x: Tensor, size: int, linear: tuple[type, ...] = (nn.Linear,)
 ) -> tuple[Tensor, Tensor] | None:
-    """Does what :func:`jacobian_of_network` does for layers in their order; those of types ``linear`` are W x + b."""
+    """Works like :func:`jacobian_of_network`, for layers in order; those of types ``linear`` are W x + b."""
     if any(not (type(layer) in linear or type(layer) in _SLOPES) or _hooked(layer) for layer in layers):
         return None
     identity = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)[:size]
@@ -71,12 +71,12 @@ def jacobian_of_layers(
 
 
 def is_older(kind: type, names: Set[str], others: Set[str]) -> bool:
-    """Tells whether a class takes ``names`` from further up among its bases than ``others``, or has none of them."""
+    """Tells whether a class inherits ``names`` from a higher base than ``others``, or has none of ``names``."""
     return next((not vars(base).keys() & names for base in kind.__mro__ if vars(base).keys() & (names | others)), False)
 
 
 def _flat(network: nn.Module) -> Iterator[nn.Module]:
-    """Yields the layers of sequences, and of those in them, but for the identity."""
+    """Yields the layers of sequences, nested ones included, except for the identity."""
     if type(network) is nn.Sequential and not _hooked(network):
         for layer in network:
             yield from _flat(layer)

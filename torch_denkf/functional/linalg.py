@@ -1,4 +1,4 @@
-"""Functions of matrices that are safe to differentiate; where one has no value, it is NaN."""
+"""Functions of matrices that are safe to differentiate; the result is NaN if a matrix has none."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from torch_denkf.functional.kernels.small_system import (
 
 
 def cholesky(matrix: Tensor) -> Tensor:
-    """Returns the lower Cholesky factor L of a symmetric positive definite matrix, NaN where there is none.
+    """Returns the lower Cholesky factor L of a symmetric positive definite matrix, NaN if there is none.
 
     ``torch.linalg.cholesky`` raises and so waits for the device; ``torch.linalg.cholesky_ex`` returns a
-    half-finished factor. Here a failure shows: that matrix of the batch, and only that, becomes NaN.
+    half-finished factor. Here, only the failed matrices of the batch become NaN.
 
     Args:
         matrix: ``[*B, N, N]``; only its lower triangle is read.
@@ -44,17 +44,17 @@ def cholesky(matrix: Tensor) -> Tensor:
 
 
 def semidefinite_root(cov: Tensor) -> Tensor:
-    """Returns a root A of a covariance, A Aᵀ = P, also of a singular one.
+    """Returns a root A of a covariance P, A Aᵀ = P; P may be singular.
 
-    It is the Cholesky factor of the correlations, with the standard deviations put back. The correlations' ridge is
-    relative, so that metres and milliradians are treated alike, and as large as round-off makes the eigenvalues of a
-    Gram matrix negative. The scaling is a constant to the gradient: any scaling gives a root of the same matrix.
+    It is the Cholesky factor of the correlations times the standard deviations. The correlations have a ridge, which
+    is relative, so that the units of the components do not matter, and covers negative eigenvalues of a Gram matrix
+    due to round-off. The scaling is a constant to the gradient: any scaling gives a root of the same matrix.
 
     Args:
         cov: P, ``[*B, N, N]``, symmetric positive semi-definite.
 
     Returns:
-        A, lower triangular, ``[*B, N, N]``; NaN where P is not positive semi-definite.
+        A, lower triangular, ``[*B, N, N]``; NaN if P is not positive semi-definite.
 
     Examples:
         >>> import torch
@@ -67,7 +67,7 @@ def semidefinite_root(cov: Tensor) -> Tensor:
 
 
 def whitened(rows: Tensor, cov: Tensor) -> Tensor:
-    """Maps rows ``[*B, E, N]`` by the inverse Cholesky factor of their covariance; components without any become 0."""
+    """Multiplies rows ``[*B, E, N]`` by the inverse Cholesky factor of their covariance; constant components give 0."""
     correlation, _, inverse = _correlation(cov)
     scaled = (rows * inverse.unsqueeze(-2)).mT
     if is_written_out(correlation, LARGEST_FACTOR):
@@ -76,18 +76,18 @@ def whitened(rows: Tensor, cov: Tensor) -> Tensor:
 
 
 def semidefinite_solve(cov: Tensor, right: Tensor, *, spare: float = 0) -> Tensor:
-    """Solves P X = Y for a covariance P, also a singular one; X then is one of the solutions.
+    """Solves P X = Y for a covariance P; if P is singular, X is one of the solutions.
 
-    It is solved in correlations with a relative ridge, see :func:`semidefinite_root`. Components without any variance
-    get zero, and their row of ``right`` should be zero.
+    The system is solved in correlations with a relative ridge, see :func:`semidefinite_root`. Components of zero
+    variance get zero; their row of ``right`` should be zero.
 
     Args:
         cov: P, ``[*B, N, N]``, symmetric positive semi-definite.
         right: Y, ``[*B, N, M]``.
-        spare: is added to the correlations' diagonal where P is not positive semi-definite, but for rounding.
+        spare: number added to the diagonal of correlations that are not positive semi-definite, up to rounding.
 
     Returns:
-        X, ``[*B, N, M]``; NaN where P is not positive semi-definite.
+        X, ``[*B, N, M]``; NaN if P is not positive semi-definite.
 
     Examples:
         >>> import torch
@@ -103,7 +103,7 @@ def semidefinite_solve(cov: Tensor, right: Tensor, *, spare: float = 0) -> Tenso
 
 
 def solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solves M X = Y for a symmetric positive definite M, NaN where it is not.
+    """Solves M X = Y for a symmetric positive definite M; NaN if M is not.
 
     Args:
         matrix: M, ``[*B, N, N]``.
@@ -120,15 +120,15 @@ def solve(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 class Solver:
-    """Solves several systems of one symmetric positive definite matrix, NaN where it is not.
+    """Solves several systems of one symmetric positive definite matrix; NaN if it is not.
 
-    A processor solves with the Cholesky factor. On a GPU, and for compilers up to :data:`LARGEST_ELIMINATED` unknowns,
-    the inverse multiplies: torch solves batches with MAGMA there, which cannot be captured into a CUDA graph, and the
-    inverse's backward pass is of products alone.
+    On a processor it solves with the Cholesky factor. On a GPU, and for compilers up to :data:`LARGEST_ELIMINATED`
+    unknowns, it multiplies by the inverse: torch solves batches with MAGMA there, which cannot be captured into a CUDA
+    graph, and the backward pass of the inverse has only products.
 
     Args:
         matrix: M, ``[*B, N, N]``.
-        ridge: is added to the diagonal.
+        ridge: number added to the diagonal.
     """
 
     def __init__(self, matrix: Tensor, ridge: float = 0):
@@ -161,9 +161,9 @@ class Solver:
 
 
 def divide(left: Tensor, matrix: Tensor) -> Tensor:
-    """Returns A M⁻¹ for a regular M that is not symmetric, of few columns, as a Jacobian is.
+    """Returns A M⁻¹ for a small regular M that is not symmetric, such as a Jacobian.
 
-    On a GPU it solves the normal equations: LU factors are MAGMA's there.
+    On a GPU it solves the normal equations, since torch computes LU factors with MAGMA there.
 
     Args:
         left: A, ``[*B, K, N]``.
@@ -200,7 +200,7 @@ class _Inverse(torch.autograd.Function):
 def is_covariance(cov: Tensor) -> Tensor:
     """Tells which matrices are covariances up to rounding: symmetric and positive semi-definite, without NaN.
 
-    Rounding is relative to the variances, so that metres and milliradians count alike. Nothing is differentiated.
+    Rounding is relative to the variances, so that units do not matter. There is no gradient.
 
     Args:
         cov: ``[*B, N, N]``.
@@ -217,17 +217,17 @@ def is_covariance(cov: Tensor) -> Tensor:
     variance, rounding = cov.diagonal(dim1=-2, dim2=-1), 100 * cov.shape[-1] * torch.finfo(cov.dtype).eps
     largest = rounding**2 * (variance.unsqueeze(-1) * variance.unsqueeze(-2))
     symmetric = ((cov - cov.mT).square() <= largest).flatten(-2).all(-1)
-    # A variance of zero is one, but next to a covariance, which the factor's next row divides by it.
+    # A variance of zero is valid, but not with a non-zero covariance, which the factor's next row divides by it.
     ridge = rounding * variance + torch.finfo(cov.dtype).tiny
     return symmetric & cholesky(cov + ridge.diag_embed())[..., -1, -1].isfinite()
 
 
 def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
-    """Returns the covariance of a noise: of variances, or as it is; NaN where it is none.
+    """Returns the covariance of a noise given as variances or covariances; NaN if it is invalid.
 
     Args:
-        noise: variances ``[*B, N]``, of which a negative one becomes NaN, or covariances ``[*B, N, N]``.
-        mean: ``[*B, S]``, which tells them apart.
+        noise: variances ``[*B, N]``, or covariances ``[*B, N, N]``; a negative variance becomes NaN.
+        mean: ``[*B, S]``, to tell them apart by the number of dimensions.
 
     Returns:
         ``[*B, N, N]``.
@@ -244,10 +244,10 @@ def as_covariance(noise: Tensor, mean: Tensor) -> Tensor:
 
 
 def _correlation(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns correlations with a ridge, standard deviations, and their inverses, 0 where there is no variance."""
+    """Returns correlations with a ridge, standard deviations, and their inverses, 0 for a variance of zero."""
     dim = cov.shape[-1]
     variance, ridge = cov.diagonal(dim1=-2, dim2=-1).detach(), 10 * dim * torch.finfo(cov.dtype).eps
-    # A variance of less than zero is not taken for one of zero, unless it is round-off next to the largest.
+    # A negative variance is invalid, unless it is round-off relative to the largest.
     negative = (variance < -ridge * variance.abs().amax(-1, keepdim=True)).any(-1, keepdim=True)
     std = torch.where(negative, torch.nan, variance.clamp(min=0).sqrt())
     empty = std == 0
@@ -263,8 +263,8 @@ def inverse_square_root(matrix: Tensor) -> Tensor:
     The symmetric square root is the one that moves the members least (Ott et al. 2004; Hunt et al. 2007).
 
     Args:
-        matrix: M, ``[*B, N, N]``; eigenvalues that round-off made negative count as zero.
-            A matrix with a NaN in it gives NaN.
+        matrix: M, ``[*B, N, N]``; eigenvalues that are negative by round-off count as zero.
+            A matrix with a NaN gives NaN.
 
     Returns:
         (I + M)^-1/2, symmetric, ``[*B, N, N]``.
@@ -307,7 +307,7 @@ def inverse_square_root_difference(matrix: Tensor) -> Tensor:
 
 
 def _differentiated() -> bool:
-    # Torch looks up the arguments' names at each call of apply, which takes longer than a small matrix does.
+    # Function.apply looks up the argument names at each call, which takes longer than a small matrix does.
     return torch.is_grad_enabled() or torch.compiler.is_compiling()
 
 
@@ -320,18 +320,18 @@ def _symmetric_function(matrix: Tensor, *, difference: bool) -> Tensor:
 
 
 class _SymmetricFunction(torch.autograd.Function):
-    """V f(Λ) Vᵀ, whose backward is V (Γ ∘ (Vᵀ Ḡ V)) Vᵀ with Γ the divided differences of f.
+    """Computes V f(Λ) Vᵀ; the backward pass is V (Γ ∘ (Vᵀ Ḡ V)) Vᵀ with Γ the divided differences of f.
 
-    The theorem of Daleckii and Krein (Higham 2008, Functions of Matrices, Theorem 3.11). eigh's own
-    backward divides by differences of eigenvalues and is NaN where two agree; written out for these two
-    functions, with r = sqrt(1 + λ), Γ divides only by numbers >= 1.
+    This is the theorem of Daleckii and Krein (Higham 2008, Functions of Matrices, Theorem 3.11). The backward pass of
+    eigh divides by differences of eigenvalues and is NaN if two agree; written out for these two functions, with
+    r = sqrt(1 + λ), Γ divides only by numbers >= 1.
     """
 
     generate_vmap_rule = True
 
     @staticmethod
     def forward(matrix: Tensor, difference: bool) -> tuple[Tensor, Tensor, Tensor]:
-        # eigh raises on the first NaN: such a matrix becomes NaN in the result, and only that one.
+        # eigh raises on the first NaN; here only the matrices with a NaN become NaN.
         finite = matrix.isfinite().all(-1).all(-1)
         eigenvalues, vectors = torch.linalg.eigh(torch.where(finite[..., None, None], matrix, 0))
         root = torch.where(finite[..., None], (1 + eigenvalues.clamp(min=0)).sqrt(), torch.nan)
@@ -357,7 +357,7 @@ class _SymmetricFunction(torch.autograd.Function):
 
 
 def product_of_known(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Returns H x, where what is NaN in x is so in those rows alone that have a coefficient for it.
+    """Returns H x; NaN in x affects only rows with a coefficient for it.
 
     Args:
         matrix: H, ``[O, S]``.

@@ -1,8 +1,8 @@
-r"""Localisation: far away, what few members show of a covariance is chance, and is tapered to zero.
+r"""Localisation: tapers covariances of distant components, which in small ensembles are sampling noise, to zero.
 
-Two ways. Where O x O matrices fit in memory, factors on the covariances go into
-:func:`~torch_denkf.functional.analyse` as its ``taper``. Where they do not, or the ensemble is to be transformed as a
-whole, each component of the state gets an analysis of its own, from the observations near it (:func:`letkf`).
+There are two ways. If O x O matrices fit in memory, factors of the covariances are passed to
+:func:`~torch_denkf.functional.analyse` as its ``taper``. If they do not, or for an ensemble transform,
+each component of the state gets its own analysis, from the observations near it (:func:`letkf`).
 """
 
 from __future__ import annotations
@@ -48,24 +48,24 @@ def gaspari_cohn(distance: Tensor, radius: float) -> Tensor:
         raise ValueError(f"radius must be positive, got {radius}")
     z = distance / (math.sqrt(10 / 3) * radius)
     near = 1 + z.square() * (-5 / 3 + z * (5 / 8 + z * (1 / 2 - z / 4)))
-    # z (4 - ...) + 4 - 2/(3 z), as polynomial over z; z is kept away from 0 where the other branch is taken.
+    # z (4 - ...) + 4 - 2/(3 z), as a polynomial over z; clamped away from 0, for finite gradients of both branches.
     far_z = z.clamp(1, 2)
     far = 4 - 2 / (3 * far_z) + far_z * (-5 + far_z * (5 / 3 + far_z * (5 / 8 + far_z * (-1 / 2 + far_z / 12))))
     return torch.where(z < 1, near, torch.where(z < 2, far, 0.0)).clamp(0, 1)
 
 
-_PAIRS = 2**24  # distances at a time, in neighbours()
+_PAIRS = 2**24  # largest number of distances at a time, in neighbours()
 
 
 class Neighbours(NamedTuple):
     """The observations near each component of a state.
 
     Attributes:
-        index: their numbers, ``[S, L]``, int64; repeated ones fill up rows with fewer than L.
-        taper: their weights in [0, 1], ``[S, L]``; 0 for those that fill up.
+        index: indices of the observations, ``[S, L]``, int64; rows with fewer than L are padded.
+        taper: their weights in [0, 1], ``[S, L]``; 0 for padding.
     """
 
-    index: Tensor  # type: ignore[assignment]  # in the place of tuple.index, which nobody needs here
+    index: Tensor  # type: ignore[assignment]  # replaces tuple.index
     taper: Tensor
 
 
@@ -75,21 +75,21 @@ def neighbours(
     """Finds the observations within the taper's reach of each component of a state.
 
     Args:
-        states: places of the components, ``[S, D]``, in any unit.
-        observations: places of the observations, ``[O, D]``.
+        states: positions of the components, ``[S, D]``, in any unit.
+        observations: positions of the observations, ``[O, D]``.
         radius: see :func:`gaspari_cohn`, in the same unit.
-        period: ``[D]``, where a coordinate is a circle, its circumference (``inf`` where it is not).
-        tile: components to look at in one go. They are sorted by their first coordinate, and compared with the
-            observations within reach of a tile's range of it, 2²⁴ pairs at a time at most.
+        period: ``[D]``, the circumference of each circular coordinate (``inf`` for the others).
+        tile: components to process at a time. They are sorted by their first coordinate, and compared with the
+            observations within reach of the tile in this coordinate, at most 2²⁴ pairs at a time.
 
     Returns:
-        :class:`Neighbours`, with L the largest number that any component has, at least 1.
+        :class:`Neighbours`, with L the largest count of any component, at least 1.
 
     Raises:
         ValueError: if the radius is not positive.
 
     Examples:
-        Five places on a circle, each sees its neighbours:
+        Each of five positions on a circle has its neighbours:
 
         >>> places = torch.arange(5.0).unsqueeze(-1)
         >>> neighbours(places, places, 0.5, period=torch.tensor([5.0])).index.sort().values.tolist()
@@ -118,15 +118,15 @@ def neighbours(
 
 
 def neighbours_of_taper(taper: Tensor, *, tile: int = 4096) -> Neighbours:
-    """Returns the observations that a taper lets count, for each component of a state.
+    """Returns the observations with a positive taper, for each component of a state.
 
     Args:
-        taper: factors in [0, 1], ``[S, O]``; 0 where an observation is not to count. They need not come from a
+        taper: factors in [0, 1], ``[S, O]``; 0 to ignore an observation. They need not be functions of a
             distance.
-        tile: components to look at in one go.
+        tile: components to process at a time.
 
     Returns:
-        :class:`Neighbours`, with L the largest number that any component has, at least 1.
+        :class:`Neighbours`, with L the largest count of any component, at least 1.
 
     Raises:
         ValueError: if the taper is not a matrix.
@@ -136,13 +136,13 @@ def neighbours_of_taper(taper: Tensor, *, tile: int = 4096) -> Neighbours:
         [[1, 0], [0, 2]]
     """
     if taper.ndim != 2:
-        raise ValueError(f"taper must be [S, O], one row a component of the state, got {list(taper.shape)}")
+        raise ValueError(f"taper must be [S, O], one row per component of the state, got {list(taper.shape)}")
     columns = torch.arange(taper.shape[1], device=taper.device)
     return _largest((part, columns) for part in taper.split(tile))
 
 
 def _largest(tapers: Iterable[tuple[Tensor, Tensor]]) -> Neighbours:
-    """Returns the entries above zero of each row, of matrices below one another, and the numbers of their columns."""
+    """Returns the positive entries of each row, for matrices stacked along rows, and the indices of their columns."""
     rows = []
     for taper, columns in tapers:
         values, places = taper.topk(max(int((taper > 0).sum(-1).max()), 1), dim=-1)
@@ -163,7 +163,7 @@ def letkf(
     significance: float | Tensor | None = None,
     tile: int = 4096,
 ) -> Tensor:
-    r"""Runs the local ensemble transform: an analysis of each component of the state, from the observations near it.
+    r"""Runs the local ensemble transform: a separate analysis of each state component, from the observations near it.
 
     With :math:`Y_s = \rho_s^{1/2} R^{-1/2} HA / \sqrt{E - 1}` of the observations near component s, its members are
     :math:`\bar x_s + A_s (w + (I + Y_s Y_s^T)^{-1/2})`, where :math:`w = (I + Y_s Y_s^T)^{-1} Y_s d` moves the mean.
@@ -171,17 +171,17 @@ def letkf(
 
     Args:
         forecast: ``[*B, E, S]`` with E >= 2, in the state's units.
-        predicted: what each member predicts, ``[*B, E, O]``, in the sensor's units.
+        predicted: the predicted observations, ``[*B, E, O]``, in the sensor's units.
         observation: one value each, ``[*B, O]``.
         noise: variances R, ``[*B, O]``, positive.
-        near: which observations count where, see :func:`neighbours`.
-        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; what is False counts nowhere, and may be NaN.
-        significance: also weigh each observation by how far its correlation with the component is significant, see
+        near: the observations of each component, see :func:`neighbours`.
+        observed: boolean, ``[*B, 1]`` or ``[*B, O]``; components with False are ignored, and may be NaN.
+        significance: weighs each observation also by the significance of its correlation with the component, see
             :func:`~torch_denkf.functional.analysis.significant`: one number, such as 1.5. ``None`` for no such weights.
-        tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch.
+        tile: components to analyse at a time; memory is ``E * L * tile`` for each element of the batch.
 
     Returns:
-        The analysis ensemble, ``[*B, E, S]``. A component without observations stays as it is, but for rounding.
+        The analysis ensemble, ``[*B, E, S]``. A component without observations is unchanged, up to rounding.
 
     Raises:
         ValueError: for shapes that do not fit.
@@ -220,7 +220,7 @@ def letkf(
         if significance is not None:
             own = part.mT.unsqueeze(-1)  # [*B, tile, E, 1]
             weight = significant(local.mT @ own, local, own, significance).mT  # [*B, tile, 1, L]
-            # The root's slope at 0 is infinite, and would be NaN times 0 in a gradient.
+            # The slope of the root at 0 is infinite, and times 0 it would make the gradient NaN.
             root = root * torch.where(weight > 0, torch.where(weight > 0, weight, 1).sqrt(), 0)
         local = local * root
         gram = local @ local.mT

@@ -57,7 +57,7 @@ def ensemble_var(ensemble: Tensor, mean: Tensor | None = None) -> Tensor:
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
-        mean: its mean, ``[*B, S]``, where that is known already.
+        mean: its mean, ``[*B, S]``, if known already.
 
     Returns:
         The variances, ``[*B, S]``, in the state's units squared.
@@ -74,13 +74,13 @@ def ensemble_var(ensemble: Tensor, mean: Tensor | None = None) -> Tensor:
         check_ensemble("ensemble", ensemble, min_size=2)
     if on_gpu(ensemble):
         return ensemble.var(-2)
-    # Twice as fast as var() over a dimension that is not the last, which takes one number at a time; both are exact.
+    # Twice as fast as var() over a dimension that is not the last, which is not vectorised; both are exact.
     anomalies = ensemble - (ensemble.mean(-2) if mean is None else mean).unsqueeze(-2)
     return anomalies.square().sum(-2) / (ensemble.shape[-2] - 1)
 
 
 def ensemble_cov(ensemble: Tensor) -> Tensor:
-    """Returns the unbiased sample covariance AᵀA / (E − 1), for looking at: the analysis never forms it.
+    """Returns the unbiased sample covariance AᵀA / (E − 1), for diagnostics; the analysis never computes it.
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.

@@ -1,8 +1,8 @@
-r"""Resampling of weighted particles: many copies of the likely ones, none of the unlikely, the same distribution.
+r"""Resampling of weighted particles: copies the likely ones and drops the unlikely ones, for the same distribution.
 
-The random numbers come in as an argument. Particle i is picked at the position :math:`(i + u_i) / E` of the weights'
-cumulative sum: one number for all of them is *systematic* resampling, where a particle of weight w appears
-:math:`\lfloor E w \rfloor` or :math:`\lceil E w \rceil` times; one number each is *stratified* resampling
+The random numbers are an argument. Particle i is picked at the position :math:`(i + u_i) / E` of the weights'
+cumulative sum. One number for all of them is *systematic* resampling: a particle of weight w appears
+:math:`\lfloor E w \rfloor` or :math:`\lceil E w \rceil` times. One number for each is *stratified* resampling
 (Douc & Cappé 2005, "Comparison of resampling schemes for particle filtering"). Both keep every weight in expectation.
 """
 
@@ -39,7 +39,7 @@ def effective_sample_size(log_weights: Tensor) -> Tensor:
 def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
     """Resamples without gradients, neither to the weights nor to the particles.
 
-    As in the first differentiable particle filter, whose gradient ends at the step (Jonschkowski et al. 2018,
+    The gradient ends at the step, as in the first differentiable particle filter (Jonschkowski et al. 2018,
     arXiv:1805.11122).
 
     Args:
@@ -48,8 +48,8 @@ def systematic_resample(particles: Tensor, log_weights: Tensor, uniform: Tensor)
         uniform: numbers in [0, 1): ``[*B, 1]`` for systematic, ``[*B, E]`` for stratified resampling.
 
     Returns:
-        The particles that were picked, ``[*B, E, S]``, and their equal log-weights −log E, ``[*B, E]``. These are NaN
-        where a weight was, so that it is not lost.
+        The picked particles, ``[*B, E, S]``, and their equal log-weights −log E, ``[*B, E]``; NaN if a weight is NaN,
+        so that the failure stays visible.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -80,11 +80,11 @@ def soft_resample(
         particles: X, ``[*B, E, S]``.
         log_weights: log wⁱ, normalised, ``[*B, E]``.
         uniform: numbers in [0, 1): ``[*B, 1]`` for systematic, ``[*B, E]`` for stratified resampling.
-        alpha: share of the uniform distribution: 0 is hard resampling, 1 leaves the weights as they are. Kloss et al.
+        alpha: share of the uniform distribution: 0 is hard resampling, 1 keeps the weights unchanged. Kloss et al.
             (2021) use 0.05.
 
     Returns:
-        The particles that were picked, ``[*B, E, S]``, and their normalised log-weights, ``[*B, E]``.
+        The picked particles, ``[*B, E, S]``, and their normalised log-weights, ``[*B, E]``.
 
     Raises:
         ValueError: if the shapes do not fit, or if ``alpha`` is outside [0, 1].
@@ -100,7 +100,7 @@ def soft_resample(
         raise ValueError(f"alpha is the share of the uniform distribution, between 0 and 1; got {alpha}.")
     proposal = (1 - alpha) * log_weights.exp() + alpha / log_weights.shape[-1]
     index = _pick(proposal.detach(), uniform)
-    # Picked first, then their logarithm: a particle that was picked has a positive probability.
+    # The logarithm is taken after picking: a particle that was picked has a positive probability.
     ratio = log_weights.gather(-1, index) - proposal.gather(-1, index).log()
     known = proposal.detach().sum(-1, keepdim=True) > 0
     return _take(particles, index), torch.where(known, ratio.log_softmax(-1), torch.nan)
@@ -109,23 +109,23 @@ def soft_resample(
 def jitter_copies(
     resampled: Tensor, particles: Tensor, log_weights: Tensor, normal: Tensor, *, factor: float = 1.0
 ) -> Tensor:
-    r"""Moves the copies that resampling made apart; one of each particle stays where it is.
+    r"""Separates the copies of resampling by jitter; one copy of each particle keeps its place.
 
-    Where the motion has no noise of its own, copies would stay copies. The jitter is Gaussian, with the covariance of
-    the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, the
+    It is for motions without noise, in which copies would stay equal. The jitter is Gaussian. Its covariance is that
+    of the weighted particles *before* resampling, times the square of :math:`\text{factor} \cdot N^{-1 / (S + 4)}`, the
     rule of Scott for a kernel's width (Musso, Oudjane & Le Gland 2001, "Improving regularised particle filters"). It
-    widens the distribution, less so with more particles. N is the *effective* number of particles. To the weighted
-    covariance comes a share 1 / N³ of that of all particles: where one or two have all the weight, which says little
-    about the spread, the kernel is wide, and a filter that has lost the state can find it again; where a few dozen
-    share the weight, it is nothing. The exponent three was found on Lorenz-63.
+    widens the distribution, less so with more particles. N is the *effective* number of particles. A share 1 / N³ of
+    the unweighted covariance is added to the weighted one: if one or two particles have all the weight, which says
+    little about the spread, the kernel is wide, and a filter that has lost the state can recover it; if a few dozen
+    share the weight, the share is negligible. The exponent three was found on Lorenz-63.
 
     Args:
-        resampled: what :func:`systematic_resample` or :func:`soft_resample` picked, ``[*B, E, S]``: copies are
-            neighbours there.
-        particles: the particles before, ``[*B, E, S]``.
-        log_weights: their log-weights before, normalised, ``[*B, E]``.
+        resampled: result of :func:`systematic_resample` or :func:`soft_resample`, ``[*B, E, S]``, in which copies are
+            adjacent.
+        particles: the particles before resampling, ``[*B, E, S]``.
+        log_weights: their log-weights before resampling, normalised, ``[*B, E]``.
         normal: standard-normal numbers ``[*B, E, S]``.
-        factor: on the width; 0 for no jitter.
+        factor: factor of the width; 0 for no jitter.
 
     Returns:
         The particles, ``[*B, E, S]``.
@@ -140,7 +140,7 @@ def jitter_copies(
         >>> jitter_copies(picked, particles, even, normal, factor=0.5).flatten()
         tensor([1.0000, 1.3367, 2.0000])
 
-        N is 3 here: the second copy of 1 moved by 3^(-1/5) / 2, times the root of the covariance 2 / 3 + 1 / 27.
+        N is 3 here: the second copy of 1 is moved by 3^(-1/5) / 2, times the root of the covariance 2 / 3 + 1 / 27.
     """
     check_particles(particles, log_weights)
     check_shape("resampled", resampled, particles.shape, "[*B, E, S]")
@@ -167,11 +167,11 @@ def _pick(probability: Tensor, uniform: Tensor) -> Tensor:
         )
     rank = torch.arange(size, dtype=probability.dtype, device=probability.device)
     cumulative = probability.cumsum(-1)
-    # The last is exactly 1 and all positions are below, also after rounding: what is found has a positive probability.
+    # The last is exactly 1 and all positions are below, also after rounding: each index has a positive probability.
     cumulative = cumulative / cumulative[..., -1:]
     below_one = 1 - torch.finfo(probability.dtype).eps / 2
     position = ((rank + uniform.to(probability.dtype)) / size).clamp(max=below_one)
-    # Where a weight is NaN, no position is found: the index stays inside, and the weights tell.
+    # If a weight is NaN, no position is found: the index is clamped, and the weights become NaN.
     return torch.searchsorted(cumulative, position.contiguous(), right=True).clamp(max=size - 1)
 
 

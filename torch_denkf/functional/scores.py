@@ -1,4 +1,4 @@
-"""Proper scores of an ensemble forecast: lower is better, and the truth's own distribution is best.
+"""Proper scores of an ensemble forecast: lower is better; the true distribution has the lowest expected score.
 
 Source: Gneiting & Raftery 2007, JASA 102, eqs. 21 and 22; the fair variants, whose expectation does not
 depend on the ensemble's size, Ferro 2014, Q. J. R. Meteorol. Soc. 140.
@@ -16,18 +16,18 @@ from torch_denkf.functional.weighted import check_particles
 
 
 def crps_ensemble(ensemble: Tensor, target: Tensor, log_weights: Tensor | None = None, *, fair: bool = True) -> Tensor:
-    """Continuous ranked probability score of each component: ``E|x − y| − 1/2 E|x − x'|``.
+    """Returns the continuous ranked probability score of each component: ``E|x − y| − 1/2 E|x − x'|``.
 
-    Sorting makes the double sum over pairs a single one: O(E log E) time, O(E) memory.
+    Sorting reduces the double sum over pairs to a single one: O(E log E) time, O(E) memory.
 
     Args:
         ensemble: X, ``[*B, E, S]``, in the state's units.
         target: the truth y, ``[*B, S]``, in the state's units.
-        log_weights: of weighted particles, normalised, ``[*B, E]``: the score is that of the weighted empirical
-            distribution, ``Σ wⁱ|xⁱ − y| − 1/2 Σ Σ wⁱwʲ|xⁱ − xʲ|``, for which ``fair`` has no meaning.
-        fair: average ``|x − x'|`` over the E (E − 1) pairs of different members, which makes the score an
-            unbiased estimate of that of the distribution they come from; otherwise over all E², which is
-            the score of the empirical distribution.
+        log_weights: log-weights of particles, normalised, ``[*B, E]``: the score is that of the weighted empirical
+            distribution, ``Σ wⁱ|xⁱ − y| − 1/2 Σ Σ wⁱwʲ|xⁱ − xʲ|``, and ``fair`` is ignored.
+        fair: average ``|x − x'|`` over the E (E − 1) pairs of different members, for an unbiased estimate of the
+            score of the distribution from which they are drawn; otherwise over all E² pairs, for the score of the
+            empirical distribution.
 
     Returns:
         The scores, ``[*B, S]``, in the state's units.
@@ -43,12 +43,12 @@ def crps_ensemble(ensemble: Tensor, target: Tensor, log_weights: Tensor | None =
         tensor([0.1250])
     """
     size = _check(ensemble, target, fair and log_weights is None)
-    # Differences to the target before sorting: no digits are lost where the mean dwarfs the spread.
+    # Differences to the target before sorting, which lose no digits if the mean is much larger than the spread.
     error, order = (ensemble - target.unsqueeze(-2)).sort(-2)
     if log_weights is not None:
         check_particles(ensemble, log_weights)
         weight = log_weights.exp().unsqueeze(-1).expand_as(error).gather(-2, order)
-        below = weight.cumsum(-2)  # the weight of all that is not above, itself included
+        below = weight.cumsum(-2)  # the weight of all particles up to this one
         return (weight * (error.abs() - (2 * below - weight - 1) * error)).sum(-2)
     rank = torch.arange(size, dtype=error.dtype, device=error.device)
     weights = (2 * rank - (size - 1)) / (size * (size - 1 if fair else size))
@@ -56,7 +56,7 @@ def crps_ensemble(ensemble: Tensor, target: Tensor, log_weights: Tensor | None =
 
 
 def crps_gaussian(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
-    r"""Continuous ranked probability score of a Gaussian, for each dimension (Gneiting et al. 2005, eq. 5).
+    r"""Returns the continuous ranked probability score of a Gaussian, per dimension (Gneiting et al. 2005, eq. 5).
 
     .. math:: \sigma \left( z (2 \Phi(z) - 1) + 2 \varphi(z) - 1/\sqrt{\pi} \right), \quad z = (y - m) / \sigma
 
@@ -92,8 +92,6 @@ def energy_score(ensemble: Tensor, target: Tensor, *, fair: bool = True) -> Tens
     Args:
         ensemble: X, ``[*B, E, S]``.
         target: the truth y, ``[*B, S]``.
-        log_weights: of weighted particles, normalised, ``[*B, E]``: the score is that of the weighted empirical
-            distribution, ``Σ wⁱ|xⁱ − y| − 1/2 Σ Σ wⁱwʲ|xⁱ − xʲ|``, for which ``fair`` has no meaning.
         fair: average over pairs of different members, as in :func:`crps_ensemble`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The unscented transform: a Gaussian as 2 S + 1 points, which go through any function without its Jacobian.
+"""The unscented transform: passes 2 S + 1 sigma points of a Gaussian through a function, without its Jacobian.
 
 Source: Julier & Uhlmann 2004, "Unscented filtering and nonlinear estimation", Proc. IEEE 92; Wan & van der Merwe 2000
 for alpha, beta and kappa; Särkkä 2013, section 5.5.
@@ -22,8 +22,8 @@ class UnscentedWeights(NamedTuple):
     """Weights of 2 S + 1 sigma points, ``[2 S + 1]`` each.
 
     Attributes:
-        mean: they add up to one.
-        cov: of the squared deviations.
+        mean: weights of the mean, which sum to one.
+        cov: weights of the covariance.
     """
 
     mean: Tensor
@@ -49,9 +49,9 @@ def unscented_weights(
         dim: S.
         alpha: spread of the points.
         beta: extra weight of the central point in the covariance.
-        kappa: secondary spread.
-        dtype: of the weights.
-        device: of the weights.
+        kappa: second scaling parameter of the spread.
+        dtype: dtype of the weights.
+        device: device of the weights.
 
     Raises:
         ValueError: if c is not positive.
@@ -70,15 +70,15 @@ def unscented_weights(
 def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float = 0.5) -> Tensor:
     r"""Returns the mean, and :math:`m \pm \sqrt{c}` times the columns of a root of P (Särkkä 2013, eq. 5.74).
 
-    The covariance may be singular: dimensions without variance stay where they are, exactly, and fully correlated
-    ones are told apart by 10 S times the machine precision of their correlation. Variances are kept to rounding.
-    Gradients are finite; a dimension without any variance passes none on to its row of ``cov``.
+    The covariance may be singular. A component of zero variance has exactly the mean's value in all points. Two
+    components count as fully correlated if their correlation is within 10 S times the machine precision of one.
+    Variances are reproduced to rounding. Gradients are finite; for a component of zero variance ``cov`` has none.
 
     Args:
         mean: m, ``[*B, S]``.
         cov: P, symmetric, positive semi-definite, ``[*B, S, S]``.
         alpha: spread of the points.
-        kappa: their secondary spread.
+        kappa: second scaling parameter of the spread.
 
     Returns:
         The points, ``[*B, 2 S + 1, S]``, the mean first; NaN where P has a clearly negative eigenvalue.
@@ -100,12 +100,13 @@ def sigma_points(mean: Tensor, cov: Tensor, *, alpha: float = 1.0, kappa: float 
 def unscented_moments(
     points: Tensor, weights: UnscentedWeights, *, space: Space | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Returns mean and covariance of sigma points after a function (Särkkä 2013, eq. 5.75).
+    """Returns mean and covariance of sigma points that a function has mapped (Särkkä 2013, eq. 5.75).
 
     Args:
         points: ``[*B, 2 S + 1, N]``.
         weights: see :func:`unscented_weights`.
-        space: one of numbers and angles; these are averaged on the side of the central point. ``None`` for numbers.
+        space: space of numbers and angles, if some are angles: they are averaged as differences to the central point.
+            ``None`` for plain numbers.
 
     Returns:
         The mean ``[*B, N]`` and the covariance ``[*B, N, N]``.
@@ -127,13 +128,13 @@ def unscented_anomalies(points: Tensor, images: Tensor, weights: UnscentedWeight
     r"""Returns the anomalies of a state and of a function of it, from sigma points (Särkkä 2013, eq. 5.75).
 
     Args:
-        points: of the state, ``[*B, 2 S + 1, S]``.
-        images: the function's values there, ``[*B, 2 S + 1, N]``.
+        points: sigma points of the state, ``[*B, 2 S + 1, S]``.
+        images: values of the function at the points, ``[*B, 2 S + 1, N]``.
         weights: see :func:`unscented_weights`.
 
     Returns:
         A ``[*B, S, 2 S + 1]``, W ``[2 S + 1, 2 S + 1]`` and B ``[*B, N, 2 S + 1]``: the state's covariance is
-        :math:`A W A^T`, that of state and function :math:`A W B^T`.
+        :math:`A W A^T`, the covariance of state and function :math:`A W B^T`.
 
     Raises:
         ValueError: if there are not as many points as weights.
@@ -144,7 +145,7 @@ def unscented_anomalies(points: Tensor, images: Tensor, weights: UnscentedWeight
         >>> (before @ weights @ after.mT).round(decimals=4)
         tensor([[3.]])
     """
-    # The points lie evenly around their mean, so that the mean of the images need not be taken off, but for digits.
+    # The points are symmetric about their mean, so centring the values does not change W B^T; it only saves digits.
     deviations = _deviations(images, weights, None)[1]
     return (points - points[..., :1, :]).mT, weights.cov.diag_embed(), deviations.mT
 
@@ -166,12 +167,12 @@ def unscented_update(
 
     Args:
         points: sigma points of the prior, ``[*B, 2 S + 1, S]``.
-        predicted: what each of them would observe, ``[*B, 2 S + 1, O]``.
+        predicted: predicted observation of each point, h(point), ``[*B, 2 S + 1, O]``.
         observation: y, ``[*B, O]``.
         noise: R, variances ``[*B, O]`` or covariances ``[*B, O, O]``.
         weights: see :func:`unscented_weights`.
         observed: mask ``[*B, 1]`` or ``[*B, O]``, see :func:`torch_denkf.functional.kalman_update`.
-        space: of the observation, one of numbers and angles; ``None`` for plain numbers.
+        space: space of the observation, made of numbers and angles; ``None`` for plain numbers.
 
     Returns:
         A :class:`torch_denkf.functional.gaussian.GaussianUpdate`.
@@ -225,12 +226,12 @@ def _spread(dim: int, alpha: float, kappa: float) -> float:
 
 
 def _deviations(points: Tensor, weights: UnscentedWeights, space: Space | None) -> tuple[Tensor, Tensor]:
-    """Returns weighted mean ``[*B, N]`` and deviations ``[*B, 2 S + 1, N]``; differences first, for the digits."""
+    """Returns weighted mean ``[*B, N]`` and deviations ``[*B, 2 S + 1, N]``, by differences to the central point."""
     check_ensemble("points", points)
     if points.shape[-2] != len(weights.mean):
         raise ValueError(
             f"there are {points.shape[-2]} points in shape {list(points.shape)} and {len(weights.mean)} weights; "
-            "points are [*B, 2 S + 1, N], and the weights are those of S dimensions"
+            "points are [*B, 2 S + 1, N], and the weights must be for S dimensions"
         )
     center = points[..., :1, :]
     space = check_space("space", space, flat=True)

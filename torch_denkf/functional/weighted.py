@@ -1,4 +1,4 @@
-"""Moments of weighted particles: the ensemble's, where each member counts with its own weight."""
+"""Moments of weighted particles, in which each member has its own weight."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def weighted_mean(particles: Tensor, log_weights: Tensor) -> Tensor:
 def weighted_var(particles: Tensor, log_weights: Tensor) -> Tensor:
     """Returns the variance of weighted particles, E / (E − 1) Σ wⁱ (xⁱ − x̄)².
 
-    The factor makes it :func:`ensemble_var` for equal weights. It does not follow the effective number of particles:
-    1 / (1 − Σ w²) instead would blow up where one particle has nearly all the weight.
+    With equal weights the factor makes it equal to :func:`ensemble_var`. It does not use the effective number of
+    particles: 1 / (1 − Σ w²) would diverge if one particle has nearly all the weight.
 
     Args:
         particles: X, ``[*B, E, S]``, in the state's units.
@@ -61,14 +61,14 @@ def weighted_var(particles: Tensor, log_weights: Tensor) -> Tensor:
 def weighted_median(particles: Tensor, log_weights: Tensor) -> Tensor:
     """Returns the weighted median of each component: half of the weight is at or below it, as far as possible.
 
-    Unlike the mean it stays where most of the weight is when a few particles run away, however far.
+    Unlike the mean it stays near most of the weight if a few particles diverge.
 
     Args:
         particles: X, ``[*B, E, S]``, in the state's units.
         log_weights: log wⁱ, normalised, ``[*B, E]``.
 
     Returns:
-        The medians, ``[*B, S]``: each is the component of a particle, the lower of two where both would do.
+        The medians, ``[*B, S]``: each is the component of a particle, the lower of two candidates.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -81,7 +81,7 @@ def weighted_median(particles: Tensor, log_weights: Tensor) -> Tensor:
     check_particles(particles, log_weights)
     ordered, order = particles.sort(-2)
     below = log_weights.exp().unsqueeze(-1).expand_as(particles).gather(-2, order).cumsum(-2)
-    # Relative to the last sum: rounding must not leave it below the half.
+    # Relative to the last sum, so that rounding cannot leave all sums below one half.
     index = (below < below[..., -1:, :] / 2).sum(-2, keepdim=True)
     return ordered.gather(-2, index).squeeze(-2)
 
@@ -91,8 +91,8 @@ def weighted_innovation(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Computes the innovation of weighted particles, its normalised square, and the log-determinant of its covariance.
 
-    The innovation is y − Σ wⁱ h(xⁱ). Its covariance is that of the predicted observations, with the factor of
-    :func:`weighted_var`, plus R. For a linear Gaussian system and many particles both are the Kalman filter's.
+    The innovation is y − Σ wⁱ h(xⁱ). Its covariance is R plus the covariance of the predicted observations, with the
+    factor of :func:`weighted_var`. For a linear Gaussian system and many particles both equal the Kalman filter's.
 
     Args:
         predicted: h(xⁱ), ``[*B, E, O]``, in the sensor's units.
@@ -103,7 +103,7 @@ def weighted_innovation(
 
     Returns:
         The innovation ``[*B, O]``, 0 where nothing was observed, and the NIS and the log-determinant, ``[*B, 1]``, over
-        what was observed.
+        the observed components.
 
     Raises:
         ValueError: if the shapes do not fit, or if there are fewer than two particles.

@@ -1,4 +1,4 @@
-"""The modules behind the forecast of a filter of several sensors: weights, and an update each or one for all."""
+"""Builds the modules after the forecast of a filter of several sensors: weights, and sequential or joint updates."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ __all__ = ["Updates"]
 
 
 class Updates:
-    """Makes the modules behind the forecast.
+    """Builds the modules after the forecast.
 
     Args:
         gaussian: whether the belief is a mean and a covariance.
         lag: L.
         size: S.
         analysis: makes an update.
-        space: in which the state lives; ``None`` for plain numbers.
+        space: space of the state; ``None`` for vectors.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Updates:
         return {"readings": join, **self._update("analysis", model, prefix, last, told, None, **keys)}
 
     def weighted(self, prefix, sensors, wired, weights):
-        """Returns the sensors' weights, and their noise after them."""
+        """Returns the modules of the sensors' weights and of their weighted noise."""
         if self.gaussian and self.space is not None:
             raise ValueError(f"weights= takes no mean and covariance of points of {self.space}: leave weights= away.")
         models = {name: self._model(prefix, name, sensor, wired[name]) for name, sensor in sensors.items()}
@@ -106,13 +106,13 @@ class Updates:
         return modules
 
     def _spaces(self, reading_space: Space | None) -> dict[str, Space]:
-        """Returns the spaces that an update is told: none of plain numbers."""
+        """Returns the space arguments of an update, without those of plain vectors."""
         spaces = {"space": self.space, "reading_space": reading_space}
         return {name: space for name, space in spaces.items() if space is not None}
 
     def _model(self, prefix: str, name: str, sensor: FusedSensor, wired: Wired) -> StateObservation:
         ensemble = (prefix, "ensemble")
-        # Without a delay only the mask of a state with a past must be told apart; a past elsewhere is not looked at.
+        # Without a delay, only a state with a lag window needs another mask.
         late = self.lag > 0 and (sensor.delay > 0 or sensor.late_key is not None or self.gaussian)
         return StateObservation(
             sensor.observation,
@@ -124,7 +124,7 @@ class Updates:
             late_key=sensor.late_key,
             past_key=None if self.gaussian or not late else ("forecast", "past"),
             state_dim=self.size if late else None,
-            # An update of a mean and a covariance runs the model inside, and reads the mask behind it.
+            # A Gaussian update runs the model inside, and reads the mask afterwards.
             seen_key=wired.observed if self.gaussian else ("forecast", name, "observed"),
         )
 
@@ -148,7 +148,7 @@ class Updates:
 
 
 def _flat_spaces(sensors: Mapping[str, FusedSensor]) -> dict[str, Space | None]:
-    """Returns the spaces of the readings, all of numbers and angles."""
+    """Returns the spaces of the readings; raises unless all consist of vectors and angles."""
     others = [name for name, sensor in sensors.items() if not is_flat(sensor.reading_space)]
     if others:
         raise ValueError(f"weights= takes readings of numbers and angles, and {others} read points: leave it away.")
@@ -156,7 +156,7 @@ def _flat_spaces(sensors: Mapping[str, FusedSensor]) -> dict[str, Space | None]:
 
 
 def _side_by_side(spaces: Mapping[str, Space | None], sizes: Sequence[int | None]) -> Space | None:
-    """Returns the space of all readings side by side; ``None`` where none has one."""
+    """Returns the product of all reading spaces; ``None`` if no reading has one."""
     if not any(spaces.values()):
         return None
     parts: list[Space] = []

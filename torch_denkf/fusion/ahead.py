@@ -1,4 +1,4 @@
-"""The belief of a later moment, forecast through actions that are under way."""
+"""Predicts the belief at the time when the next action takes effect, through the actions under way."""
 
 from __future__ import annotations
 
@@ -21,31 +21,33 @@ __all__ = ["BeliefAhead"]
 
 
 class BeliefAhead(Checked, TensorDictModuleBase):
-    """Writes the belief of the moment when the next action will run, beside the belief of now.
+    """Predicts the belief at the time when the next action takes effect, in addition to the present belief.
 
-    Between a reading and the action that follows from it a robot needs time, and moves on by the actions that were sent
-    before. The belief of now is forecast through these, one step of the filter after the other, with its process noise:
-    the spread is that of the later moment. It stands under ``"ahead"``, e.g. ``("ahead", "belief", "mean")``.
+    Between a reading and the resulting action a robot needs time, in which it moves by the actions sent before. The
+    present belief is predicted through these, step by step, with the filter's process noise, so that its spread is that
+    of the later time. It is stored under ``"ahead"``, e.g. ``("ahead", "belief", "mean")``.
 
-    * In a loop, call it on what :meth:`Filter.step` returned; on what :meth:`Filter.sequence` returned, it looks ahead
+    * In a loop, call it on the result of :meth:`Filter.step`; on the result of :meth:`Filter.sequence`, it predicts
       from each element.
     * In an environment, give it to :class:`~torch_denkf.transforms.DEnKFTransform` as ``ahead=``.
-    * In a policy, put it behind the filter. Its draws are kept with the data, as the filter's own are.
+    * In a policy, put it after the filter. Its draws are stored with the data, like those of the filter.
 
     Args:
-        filter: whose belief it is; not a part of this module, which has no parameters.
-        ahead: how far, in steps of the filter; with ``dt``, in seconds. A number, or an entry ``[*B, 1]`` of the data.
-        most: the largest of the entry's values; larger ones raise.
+        filter: filter of the belief; it is not a submodule, and this module has no parameters.
+        ahead: prediction horizon in steps of the filter; with ``dt``, in seconds. A number, or an entry ``[*B, 1]`` of
+            the data.
+        most: largest horizon in that entry; larger values raise.
         dt: seconds of a step. Seconds of an entry are rounded to whole steps unless there is a ``dt_key``.
-        dt_key: the entry ``[*B, 1]`` by which the transition knows the length of its step; the last one is then shorter
-            where ``ahead`` is no multiple of ``dt``.
-        actions: entry ``[*B, K, A]`` with the actions under way, the one that runs now first, as
-            :class:`~torch_denkf.envs.LateActions` writes it; read where the filter has a control, K at least the steps.
-        each: whether to write the beliefs of all steps up to there, ``[*B, K, ...]``, for a chunk of actions.
+        dt_key: entry ``[*B, 1]`` with the step length for the transition; the last step is then shorter if ``ahead`` is
+            no multiple of ``dt``.
+        actions: entry ``[*B, K, A]`` with the actions under way, the present one first, as
+            :class:`~torch_denkf.envs.LateActions` writes it; needed if the filter has a control. K is at least the
+            number of steps.
+        each: whether to write the beliefs of all steps up to the horizon, ``[*B, K, ...]``, for a chunk of actions.
         keep: entries of the belief to write; all by default.
 
     Raises:
-        ValueError: if a number is out of range, or seconds are no whole steps and there is no ``dt_key``.
+        ValueError: if a number is out of range, or seconds are no multiple of ``dt`` without a ``dt_key``.
         KeyError: if ``keep`` names no entry of the belief; in a call, if an entry is missing.
 
     Example:
@@ -100,7 +102,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
         unknown = [key for key in keys if key not in structure.belief]
         if unknown:
             raise KeyError(f"keep names {unknown}; the belief has {filter.belief_keys}.")
-        # In a list: the parameters are those of the filter, which is in the same policy or transform.
+        # A list hides the filter from nn.Module: it is registered in the same policy or transform already.
         self._filter = [filter]
         self.belief_keys = [filter.outer(key) for key in keys]
         self.out_keys = [_later(key) for key in self.belief_keys]
@@ -118,15 +120,15 @@ class BeliefAhead(Checked, TensorDictModuleBase):
 
     @property
     def filter(self) -> Filter:
-        """Returns the filter whose belief it is."""
+        """Returns the filter."""
         return self._filter[0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the later belief, for every element of ``[*B]``, or of a sequence ``[*B, T]``.
 
         Raises:
-            KeyError: if the belief, the actions or how far to look are missing.
-            ValueError: if there are fewer actions than steps, or an entry says more than ``most``.
+            KeyError: if the belief, the actions or the horizon are missing.
+            ValueError: if there are fewer actions than steps, or a horizon exceeds ``most``.
         """
         filter, size = self.filter, tensordict.batch_size
         lacking = [key for key in (*filter.carry_keys, self.ahead_key, self.actions_key) if key is not None]
@@ -170,9 +172,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
         return tensordict
 
     def _wanted(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Returns the prediction horizon in steps and parts of one, ``[*B, 1]``; ``None`` where it is the same
-        everywhere.
-        """
+        """Returns the prediction horizon in steps and fractions, ``[*B, 1]``; ``None`` if it is constant."""
         if self.ahead_key is None:
             if self.dt_key is None:
                 return None
@@ -201,7 +201,7 @@ class BeliefAhead(Checked, TensorDictModuleBase):
             now.set(self.dt_key, self.dt * (wanted - k).clamp(0.0, 1.0))
 
     def _noise(self, now: TensorDictBase, size: torch.Size) -> TensorDictBase | None:
-        """Draws what one forecast takes."""
+        """Draws the noise of one forecast."""
         filter = self.filter
         if not filter.draws.places:
             return None

@@ -1,4 +1,4 @@
-"""One filter of several sensors, each with its own rate, noise, mask and delay."""
+"""Filter of several sensors, each with its own rate, noise, mask and delay."""
 
 from __future__ import annotations
 
@@ -41,53 +41,52 @@ __all__ = ["FusedFilter"]
 
 
 class FusedFilter(Filter):
-    """A filter of any number of sensors, each with its own rate, noise, mask and delay.
+    """Fuses any number of sensors, each with its own rate, noise, mask and delay.
 
-    The belief follows from ``initial``: an ensemble, or a mean and a covariance (a Kalman, extended or unscented Kalman
-    filter). In each step the transition forecasts, and the readings that are there correct the forecast: one sensor
-    after the other, or all in one update. For linear Gaussian systems both give the same. The first takes less where
-    sensors are many, and lets each linearise at the belief that the sensors before it left.
+    The kind of belief is that of ``initial``: an ensemble, or a mean and a covariance (a Kalman, extended or unscented
+    Kalman filter). In each step the transition forecasts, and the observed readings correct the forecast: sequentially,
+    or in one joint update. For linear Gaussian systems both give the same. Sequential updates cost less for many
+    sensors, and each sensor linearises at the belief after the sensors before it.
 
-    Readings that come late need the last L states next to the belief, L the largest delay. An ensemble carries them as
-    :class:`~torch_denkf.smoothers.FixedLag` does; a mean and a covariance as one joint Gaussian, which for linear
-    systems gives what readings in their order give. With process noise and few members, the sample covariances of an
-    ensemble make a difference between late and in order, which falls with more members; with :class:`Refiltering` there
-    is none. Where there is a delay, the belief of L steps ago stands under ``("smoothed", ...)``. A reading that
-    belongs to the time before the episode is not observed.
+    Delayed readings need the last L states in addition to the belief, where L is the largest delay. An ensemble carries
+    them like :class:`~torch_denkf.smoothers.FixedLag`; a mean and a covariance carry one joint Gaussian, which for
+    linear systems gives the result of readings in order. For an ensemble with process noise, sampling errors of the
+    covariances make delayed readings differ from readings in order, less so with more members; :class:`Refiltering`
+    avoids this. With a delay, the belief of L steps ago is stored under ``("smoothed", ...)``. A reading of a time
+    before the episode is not observed.
 
-    An analysis' inflation and relaxation spread the belief of the present, once in each update that observes anything.
-    A late reading would have to spread a belief of the past, of which the updates since did not know: with a delay both
-    raise, and so they do with the lag of a mean and a covariance. :class:`Refiltering` and
-    :class:`~torch_denkf.smoothers.FixedLag` take them.
+    Inflation and relaxation of an analysis spread the present belief, once in each update with an observation. A
+    delayed reading would have to inflate an earlier belief, after later updates: with a delay both raise, and also with
+    a lag of a mean and a covariance. :class:`Refiltering` and :class:`~torch_denkf.smoothers.FixedLag` take them.
 
-    Diagnostics of the sensors stand under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
+    Diagnostics of the sensors are stored under ``("info", NAME, ...)``, their sums under ``("info", "nis")`` and
     ``("info", "log_likelihood")``; with one sensor, or a joint update, ``("info", ...)``.
 
     Args:
-        transition: forecasts an ensemble; or, for a mean and a covariance,
+        transition: transition of an ensemble; or, for a mean and a covariance,
             :class:`~torch_denkf.modules.LinearTransition`, :class:`~torch_denkf.modules.EKFTransition` or
-            :class:`~torch_denkf.modules.UKFTransition`, or a transition of ensembles, which becomes that of an extended
-            Kalman filter.
+            :class:`~torch_denkf.modules.UKFTransition`, or a transition of ensembles, which an extended Kalman filter
+            linearises.
         sensors: by name, in the order of their updates.
         initial: the initial belief.
         process_noise: Q of the motion: standard deviations ``[S]`` (a number for all), or a module that writes Q.
-        joint: whether all readings make one update.
-        analysis: makes the update of each sensor, or of all. For an ensemble it gets keys as
-            :class:`~torch_denkf.modules.EnsembleAnalysis` takes them, ``partial(EnsembleAnalysis, "etkf")`` by default;
-            for a mean and a covariance an observation model in front of them, as
+        joint: whether all readings are in one update.
+        analysis: constructor of the update of each sensor, or of the joint update. For an ensemble it gets the keyword
+            arguments of :class:`~torch_denkf.modules.EnsembleAnalysis`, and is ``partial(EnsembleAnalysis, "etkf")`` by
+            default; for a mean and a covariance it also gets an observation model first, like
             :class:`~torch_denkf.modules.EKFAnalysis`.
-        weights: a network that says how much each reading counts, :class:`~torch_denkf.fusion.SensorAttention`; the
-            weights ``[*B, 1]`` stand under ``("weight", NAME)``. ``None``: readings count as their noise says.
+        weights: network of the readings' weights, :class:`~torch_denkf.fusion.SensorAttention`; the weights ``[*B, 1]``
+            are stored under ``("weight", NAME)``. ``None``: the noise alone weights the readings.
         lag: L; by default the largest delay.
         **kwargs: ``control_keys``, ``init_key``, ``update_at_reset``, ``forecast_keys``, ``variance_ceiling``,
             ``check_finite`` and ``prefix`` of :class:`Filter`.
 
     Raises:
         ValueError: if there is no sensor, a delay is negative or beyond the lag, process noise is missing or given
-            twice, an analysis inflates or relaxes where it must not or names a ``reading_space``, or a sensor has
-            errors that last and its readings live on a space.
-        TypeError: for particles, sensors that are no dict, an analysis in the place of what makes it, or one that
-            cannot correct earlier states.
+            twice, an analysis inflates or relaxes together with a delay or lag, or names a ``reading_space``, or a
+            sensor with coloured noise has readings on a space.
+        TypeError: for particles, sensors that are no dict, an analysis module instead of its constructor, or an
+            analysis that cannot correct earlier states.
 
     Example:
         >>> from tensordict import TensorDict
@@ -99,7 +98,7 @@ class FusedFilter(Filter):
         ...     initial=MomentPrior(torch.zeros(2), torch.eye(2)),
         ... )
         >>> drive = TensorDict({"wheel": torch.ones(20, 1), "gps": torch.ones(20, 1)}, [20])
-        >>> drive["gps_observed"] = torch.arange(20).unsqueeze(-1) % 10 == 3  # a fix a second, 0.3 s late
+        >>> drive["gps_observed"] = torch.arange(20).unsqueeze(-1) % 10 == 3  # one fix per second, 0.3 s late
         >>> cart.sequence(drive)["info", "gps", "nis"].count_nonzero()
         tensor(2)
     """
@@ -169,7 +168,7 @@ def _is_gaussian(initial: TensorDictModuleBase) -> bool:
 
 
 def _check_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, joint_past: bool) -> None:
-    """Raises where an update would spread other states than the present one that is read."""
+    """Raises if an update with inflation or relaxation would spread states other than the observed present one."""
     if late:
         why = "belongs to the step at which a reading is taken, and with delay= others have been made since"
         cure = "Leave delay= out and let Refiltering make them again"
@@ -189,7 +188,7 @@ def _check_inflation(updates: Mapping[str, TensorDictModuleBase], late: bool, jo
 
 
 def _lag_of(sensors: Mapping[str, FusedSensor], lag: int | None) -> int:
-    """Returns L: what is given, or the largest delay."""
+    """Returns L: the given lag, or the largest delay."""
     for name, sensor in sensors.items():
         check_count(f"delay of {name!r}", sensor.delay, least=0)
         if sensor.late_key is not None and sensor.delay < 1:
@@ -224,7 +223,7 @@ def _with_errors(transition, process_noise, initial, sensors):
             end += len(sensor.sensor_error)
         made[name] = replace(sensor, observation=OfOwnErrors(observation, range(begin, end), total))
         begin = end
-    if isinstance(moments, GaussianTransition):  # the same, of the larger state
+    if isinstance(moments, GaussianTransition):  # the same transition of the augmented state
         whole = copy(moments)
         whole._modules = {**moments._modules, "module": transition, "process_noise": process_noise}
         transition, process_noise = whole, None
@@ -232,7 +231,7 @@ def _with_errors(transition, process_noise, initial, sensors):
 
 
 def _check_motion(transition, process_noise, initial, gaussian):
-    """Raises unless the transition moves the belief, and has its process noise once."""
+    """Raises unless the transition fits the kind of belief, and process noise is given exactly once."""
     moments = isinstance(transition, LinearTransition | GaussianTransition)
     if moments and not gaussian:
         raise ValueError(

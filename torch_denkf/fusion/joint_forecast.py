@@ -1,4 +1,4 @@
-"""One Gaussian of the present state and of the last L states."""
+"""Forecast of the joint Gaussian of the present state and the last L states."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch_denkf.functional.smoothing.rts import smoothing_gain
 def joint_forecast(
     mean: Tensor, cov: Tensor, cross: Tensor, joint_mean: Tensor, joint_cov: Tensor, *, unmoved: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Moves a joint Gaussian of L + 1 states on by one step; its oldest state is forgotten.
+    """Predicts a joint Gaussian of L + 1 states by one step, and drops its oldest state.
 
-    The past enters the forecast through the last state alone: its covariance with an earlier state is G^T times that of
-    the last state with it, with the smoother's gain G (Särkkä 2013, section 8.2). Means may be points of a space;
-    covariances are then of their tangents.
+    The forecast depends on the lag window only through the last state: its covariance with an earlier state is G^T
+    times the covariance of the last and the earlier state, with the smoother's gain G (Särkkä 2013, section 8.2). Means
+    may be points of a space; covariances are then of tangents.
 
     Args:
-        mean: of the forecast, ``[*B, S]``, in the state's units.
-        cov: of the forecast, ``[*B, S, S]``.
-        cross: covariance of the last state, in rows, and the forecast, ``[*B, S, S]``.
-        joint_mean: of the L + 1 states before, the latest first, ``[*B, (L + 1) S]``.
+        mean: mean of the forecast, ``[*B, S]``, in the state's units.
+        cov: covariance of the forecast, ``[*B, S, S]``.
+        cross: cross-covariance of the last state (rows) and the forecast, ``[*B, S, S]``.
+        joint_mean: mean of the L + 1 previous states, the latest first, ``[*B, (L + 1) S]``.
         joint_cov: their covariance, ``[*B, (L + 1) S, (L + 1) S]``.
-        unmoved: boolean, ``[*B, 1]``: where the forecast is the last state itself. ``None``: nowhere.
+        unmoved: mask ``[*B, 1]`` of rows whose forecast equals the last state; ``None`` for none.
 
     Returns:
         Mean and covariance of the forecast and the L states before it.

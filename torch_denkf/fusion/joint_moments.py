@@ -1,8 +1,8 @@
-r"""A mean and a covariance of the present state and the last L states together, for readings that come late.
+r"""Joint mean and covariance of the present state and the last L states, for delayed readings.
 
-:class:`torch_denkf.fusion.FusedFilter` puts these parts around the update of a Kalman filter. A reading of any of the
-L + 1 states is a reading of the joint state, so that the update itself needs nothing new. For linear systems the result
-is that of readings in their order.
+:class:`torch_denkf.fusion.FusedFilter` puts these parts around the update of a Kalman filter. A reading of any of the L
++ 1 states is a reading of the joint state, so that the update itself does not change. For linear systems the result
+equals that of readings in order.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _present_and_oldest(
 
 
 def _ends(mean: torch.Tensor, cov: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
-    """Returns mean, covariance and variance of the first and of the last of ``count`` states in a joint one."""
+    """Returns mean, covariance and variance of the first and the last of ``count`` states in a joint state."""
     out: list[torch.Tensor] = []
     points, tangents = mean.shape[-1] // count, cov.shape[-1] // count
     for own, at in ((slice(points), slice(tangents)), (slice(-points, None), slice(-tangents, None))):
@@ -41,20 +41,20 @@ def _ends(mean: torch.Tensor, cov: torch.Tensor, count: int) -> tuple[torch.Tens
 
 
 def joint_space(space: Space | None, lag: int) -> Space | None:
-    """Returns the space of the present and the last L states; ``None`` for plain numbers."""
+    """Returns the space of the present and the last L states; ``None`` for vectors."""
     return space if space is None or not lag else check_space("space", Repeated(space, lag + 1))
 
 
 _MOMENTS = ("mean", "cov", "var")
-#: Mean ``[*B, (L + 1) S]`` and covariance of the present and the past states, the latest first; on a space, points and
-#: the covariance of all their tangents.
+#: Mean ``[*B, (L + 1) S]`` and covariance of the present and the states of the lag window, the latest first; on a
+#: space, points and the covariance of all their tangents.
 JOINT_PAST = Past(("joint_mean", "joint_cov"), _MOMENTS, _copies, _present_and_oldest, present=_MOMENTS)
 
 
 class JointForecast(SubModel):
-    """The joint state moves on by one step: the forecast in front of the last belief's states, the oldest is forgotten.
+    """Predicts the joint state by one step: puts the forecast before the previous states, and drops the oldest.
 
-    It reads what :class:`CrossTransition` wrote, and writes ``("joint", "mean")`` ``[*B, (L + 1) S]`` and
+    It reads the outputs of :class:`CrossTransition`, and writes ``("joint", "mean")`` ``[*B, (L + 1) S]`` and
     ``("joint", "cov")``.
     """
 
@@ -70,7 +70,7 @@ class JointForecast(SubModel):
 
 
 class PresentOfJoint(SubModel):
-    """The belief of the present state and of the state L steps ago, from the joint state after all readings.
+    """Extracts the beliefs of the present state and of the state L steps ago from the updated joint state.
 
     Args:
         count: L + 1.

@@ -1,4 +1,4 @@
-"""A log of messages as rows that a filter reads: each at its own time, none moved to a clock."""
+"""Conversion of a log of asynchronous messages to rows for a filter, without resampling to a clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch_denkf.diagnosis.logs import SECONDS, Unit, in_origin, look_at_numbers
 
 __all__ = ["message_rows"]
 
-_SILENT = 20  # usual steps without a message of a sensor that drives the motion
+_SILENT = 20  # median steps without a message from which a driving sensor counts as silent
 
 
 def message_rows(
@@ -29,43 +29,42 @@ def message_rows(
     origin: Mapping[str, Any] | None = None,
     dtype: torch.dtype | None = None,
 ) -> TensorDict:
-    """Returns rows ``[T]`` of a log in which sensors of different rates write when they like.
+    """Returns rows ``[T]`` of a log of asynchronous sensors with different rates.
 
-    Each time at which a sensor has read is a row, and ``"dt"`` ``[T, 1]`` holds the seconds since the row before: the
-    motion must read it. The first row is the start of the filter; no message stands there. A sensor that says two
-    things about one time gets two rows, the second with a ``dt`` of zero.
+    Each time of a reading is a row, and ``"dt"`` ``[T, 1]`` is the time since the row before, s: the transition must
+    read it. The first row is the start of the filter, and has no message. Two messages of a sensor with the same stamp
+    get two rows, the second with a ``dt`` of zero.
 
-    A sensor's reading stands under its name, ``[T, O]``, and its mask under NAME_observed, as
-    :class:`~torch_denkf.fusion.FusedSensor` expects them; rows without one hold NaN. Where messages bring their noise,
-    that stands under NAME_noise: the name to give to ``FusedSensor(noise=...)``.
+    A sensor's reading is stored under its name, ``[T, O]``, and its mask under NAME_observed, as
+    :class:`~torch_denkf.fusion.FusedSensor` expects them; rows without a reading are NaN. Noise in messages is stored
+    under NAME_noise, the key for ``FusedSensor(noise=...)``.
 
     Args:
-        messages: ``(stamp, sensor, value)`` or ``(stamp, sensor, value, noise)``, in any order: the stamp, the
-            sensor's name, ``[O]`` numbers, and the reading's variances ``[O]`` or covariance ``[O, O]``,
-            of tangents where it is a point of a space.
-        driving: sensors that drive the motion, such as ``"imu"``. They have no mask: each row holds the mean since the
-            row before, on straight lines between the messages, each of which counts for the moment of its stamp; before
-            the first and behind the last it stays as it is there; a warning says where that, or a silence between two
-            messages, is longer than twenty of its usual steps. Messages of them that are not finite are left out.
-        rows_of: sensors whose times are rows: all that do not drive, and of those that do the ones whose every message
-            is to be a step; by default all. A fast one that is left out is a mean over each longer step.
-        delays: by how many seconds a sensor's stamps are later than what it saw, by name.
-        start: time of the first row, in seconds; by default that of the first reading. What was read before is left
-            out.
+        messages: ``(stamp, sensor, value)`` or ``(stamp, sensor, value, noise)``, in any order: the stamp, the sensor's
+            name, ``[O]`` numbers, and the reading's variances ``[O]`` or covariance ``[O, O]``, of tangents if the
+            reading is a point of a space.
+        driving: sensors that drive the motion, such as ``"imu"``. They have no mask: each row has the mean since the
+            row before, with linear interpolation between the messages, and constant extrapolation before the first and
+            after the last. A gap longer than twenty median steps warns. Messages that are not finite are left out.
+        rows_of: sensors whose times become rows: all that do not drive, and optionally driving ones; by default all. A
+            fast driving sensor that is left out is averaged over each longer step.
+        delays: delay of each sensor's stamps after the measurement, s, by name.
+        start: time of the first row, in seconds; by default that of the first reading. Earlier readings are left out.
         unit: of the stamps: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``. All else is in seconds.
-        origin: what is subtracted from the readings of a sensor, by its name, a number or ``[O]``, in float64, before
-            they become float32, which has seven digits: of metres of a map, degrees of latitude or encoder ticks the
-            last ones are lost. A warning says where.
+        origin: offset that is subtracted from the readings of a sensor, by name, a number or ``[O]``, in float64,
+            before the conversion to float32, which has seven digits: metres of a map, degrees of latitude or encoder
+            ticks lose their last ones. A warning says where.
         dtype: of the numbers, floating; torch's default.
 
     Returns:
         The rows, with ``"stamp"`` ``[T, 1]`` in float64.
 
     Raises:
-        ValueError: if there is no message, one is malformed or has no finite stamp, a noise is not positive, the
-            messages of a sensor differ in size, only some of them bring a noise, two entries have one name, an element
-            is masked, all messages are from before ``start``, or one that drives has none in the time of the others.
-        KeyError: if ``driving``, ``delays`` or ``origin`` name a sensor that has no message.
+        ValueError: if there is no message, a message is malformed or has no finite stamp, a noise is not positive, the
+            messages of a sensor differ in size, only some of them have a noise, two entries have the same name, an
+            element is masked, all messages are before ``start``, or a driving sensor has no message in the time of the
+            others.
+        KeyError: if ``driving``, ``delays`` or ``origin`` name a sensor without messages.
         TypeError: for a ``dtype`` that is not floating.
 
     Example:
@@ -138,7 +137,7 @@ class _Stream:
     noise: np.ndarray | None
 
     def kept(self, which: np.ndarray) -> _Stream:
-        """Returns the messages at some places."""
+        """Returns the messages that a mask or index selects."""
         return _Stream(self.times[which], self.values[which], None if self.noise is None else self.noise[which])
 
     def since(self, first: float) -> _Stream:
@@ -153,12 +152,12 @@ class _Stream:
         return finite.kept(np.append(np.diff(finite.times) > 0, True))
 
     def events(self) -> np.ndarray:
-        """Returns, for each message, its time and the number of earlier ones of its sensor and time, ``[m, 2]``."""
+        """Returns, for each message, its time and the number of earlier messages with the same time, ``[m, 2]``."""
         before = np.arange(len(self.times)) - np.searchsorted(self.times, self.times)
         return np.stack([self.times, before.astype(float)], 1)
 
     def rows(self, name: str, place: np.ndarray, count: int) -> dict[str, np.ndarray]:
-        """Readings, their mask, and their noise, in the rows in which they stand."""
+        """Returns readings, their mask, and their noise, in their rows."""
         value, observed = np.full((count, *self.values.shape[1:]), np.nan), np.zeros((count, 1), bool)
         value[place], observed[place] = self.values, True
         found = {name: value, f"{name}_observed": observed}
@@ -170,19 +169,19 @@ class _Stream:
         return found
 
     def means(self, times: np.ndarray) -> np.ndarray:
-        """Returns means from each of the ``times`` before to the next, interpolating messages linearly ``[T, O]``."""
+        """Returns means between successive ``times`` of the linearly interpolated messages, ``[T, O]``."""
         now = np.stack([np.interp(times, self.times, column) for column in self.values.T], 1)
         knots = np.unique(np.concatenate([times, self.times]))
         on = np.stack([np.interp(knots, self.times, column) for column in self.values.T], 1)
         area = np.append(np.diff(knots)[:, None] * (on[1:] + on[:-1]) / 2, np.zeros_like(on[:1]), 0)
-        # Each row sums its own pieces: one outlier must not spoil the rows that follow.
+        # Each row has a sum of its own, instead of differences of one cumulative sum: an outlier affects no later row.
         total, step = np.add.reduceat(area, np.searchsorted(knots, times), 0)[:-1], np.diff(times)[:, None]
         now[1:] = np.where(step > 0, total / np.where(step > 0, step, 1.0), now[1:])
         return now
 
 
 def _look_at_gaps(streams: Mapping[str, _Stream], unit: str) -> None:
-    """Looks at the times of all sensors together, in the name of the one that speaks before the longest gap."""
+    """Warns of gaps in the times of all sensors together; the warning names the sensor before the longest gap."""
     names = np.concatenate([np.repeat(name, len(stream.times)) for name, stream in streams.items()])
     times = np.concatenate([stream.times for stream in streams.values()])
     order = np.argsort(times, kind="stable")
@@ -191,10 +190,10 @@ def _look_at_gaps(streams: Mapping[str, _Stream], unit: str) -> None:
 
 
 def _look_at_silence(name: str, times: np.ndarray, others: np.ndarray) -> None:
-    """Warns where a sensor that drives the motion says nothing while others read.
+    """Warns of gaps in a driving sensor while others have readings.
 
     Raises:
-        ValueError: if it says nothing in all of that time.
+        ValueError: if it has no message in all of that time.
     """
     if not len(others):
         return
@@ -258,7 +257,7 @@ def _by_sensor(messages: Iterable[Sequence[Any]], unit: str) -> dict[str, _Strea
 def _floats(what: str, given: Any, ndim: int | None = None) -> np.ndarray:
     try:
         array = np.asarray(given, float)
-    except (TypeError, ValueError, RuntimeError):  # RuntimeError: of a tensor that needs a gradient
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor that requires a gradient
         array = None
     if given is None or array is None or array.ndim != (array.ndim if ndim is None else ndim):
         raise ValueError(f"{what} that is no number: {given!r}")
@@ -267,9 +266,9 @@ def _floats(what: str, given: Any, ndim: int | None = None) -> np.ndarray:
 
 def _check_noise(what: str, noise: np.ndarray, size: int) -> None:
     square = noise.ndim == 2 and noise.shape[0] == noise.shape[1]
-    if not (noise.ndim == 1 or square) or not 0 < len(noise) <= size:  # a tangent may have fewer numbers than a point
+    if not (noise.ndim == 1 or square) or not 0 < len(noise) <= size:  # tangents may have fewer components than points
         raise ValueError(f"{what} of {list(noise.shape)}: give variances [O] or a covariance [O, O].")
-    least = np.linalg.eigvalsh(noise).min() if square else noise.min()  # it reads one triangle alone
+    least = np.linalg.eigvalsh(noise).min() if square else noise.min()  # eigvalsh reads one triangle only
     scale = np.sqrt(np.outer(noise.diagonal(), noise.diagonal())) if least > 0 and square else 1.0
     if not least > 0 or (square and not (abs(noise - noise.T) <= 1e-4 * scale).all()):
         raise ValueError(

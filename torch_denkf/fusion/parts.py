@@ -1,4 +1,4 @@
-"""Parts for filters of several sensors: modules under other keys, readings that come late, readings side by side."""
+"""Parts for filters of several sensors: renamed keys, delayed readings, joint readings."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ __all__ = ["JoinedObservation", "JoinedReading", "LinearMembers", "OfOwnErrors",
 
 @passes_on(Sensor)
 class Renamed(Wrapper, Sensor):
-    """A module that reads and writes under other keys, so that two of a kind fit into one filter.
+    """Wraps a module to read and write under other keys, so that a filter can have two of a kind.
 
     Args:
         module: any module of a filter; its noise keeps its place.
-        keys: the module's own keys, and those to use in their place.
+        keys: maps the module's keys to the new ones.
 
     Example:
         >>> from tensordict import TensorDict
@@ -55,12 +55,12 @@ class Renamed(Wrapper, Sensor):
 
 
 class OfOwnErrors(Wrapper):
-    """An observation model of one sensor, of a state that has the biases of several behind its system.
+    """Observation model of one sensor for a state that is augmented by the biases of several sensors.
 
     Args:
-        observation: of the system, and of the sensor's own errors behind it, where it has some.
-        own: numbers of these among all errors.
-        total: how many errors the state holds.
+        observation: observation model of the system state, followed by the sensor's own errors, if it has any.
+        own: indices of these among all errors.
+        total: number of errors in the state.
     """
 
     def __init__(self, observation: TensorDictModuleBase, own: Sequence[int], total: int):
@@ -73,7 +73,7 @@ class OfOwnErrors(Wrapper):
         return self.run_inside({**entries, key: state}, call)
 
     def linearised(self, entries, call):
-        """Returns the Jacobian of the model, and zeros by the errors of others."""
+        """Returns the Jacobian of the model, with zeros for the errors of other sensors."""
         key, state = self._seen(entries)
         found = linearise(self.module, {**entries, key: state}, call)
         if found is None:
@@ -84,7 +84,7 @@ class OfOwnErrors(Wrapper):
         return written, whole.index_add(-1, _places(self.own, begin, whole), matrix[..., begin:]), sides
 
     def _seen(self, entries: Entries) -> tuple[NestedKey, Tensor]:
-        """Returns the key and the value of what the sensor sees of the state."""
+        """Returns the key and the value of the state that the sensor observes."""
         key = unravel_key(self.in_keys[0])
         system, errors = self.required(entries, key).tensor_split([-self.total], -1)
         return key, torch.cat([system, errors[..., self.own]], -1)
@@ -94,7 +94,7 @@ class LinearMembers(SubModel):
     """Moves the members of an ensemble as a linear transition moves a mean, :math:`F x + B a`.
 
     Args:
-        transition: whose matrices are taken, and trained.
+        transition: linear transition that has the matrices and is trained.
 
     Example:
         >>> from tensordict import TensorDict
@@ -128,22 +128,23 @@ class LinearMembers(SubModel):
 
 
 class StateObservation(Wrapper, Update):
-    """An observation model of one sensor, of the present state or of an earlier one that a late reading belongs to.
+    """Observation model of one sensor for the present state, or for the earlier state of a delayed reading.
 
     Args:
-        observation: observes ensembles, e.g. :class:`Select`; it reads its first key, and writes its first.
-        ensemble_key: the states to observe, ``[*B, E, S]``; without ``past_key`` they hold the past themselves, the
+        observation: observation model of ensembles, e.g. :class:`Select`; its first input key is the state, its first
+            output key the prediction.
+        ensemble_key: the states to observe, ``[*B, E, S]``; without ``past_key`` they contain the lag window, the
             latest first: ``[*B, E, (L + 1) S]``.
         predicted_key: predicted observations, ``[*B, E, O]``.
-        reading_keys: what is compared with them, and its noise.
+        reading_keys: keys of the reading and its noise.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
-        delay: by how many steps readings are late.
-        late_key: optional entry that says it for each, ``[*B, 1]`` int64, 0 to L.
+        delay: latency of the readings in steps.
+        late_key: optional entry with the latency of each reading, ``[*B, 1]`` int64, 0 to L.
         past_key: the last L states, ``[*B, E, L, S]``.
-        state_dim: S, where there is a past: then the mask is written, too.
-        seen_key: the mask ``[*B, O]`` or ``[*B, 1]`` that is written: a reading that belongs to the time before the
-            episode, or before the lag, is not observed.
-        age_key: by how many steps the oldest state lay back one step ago, ``[*B, 1]``.
+        state_dim: S, if there is a lag window: then the mask is written, too.
+        seen_key: written mask ``[*B, O]`` or ``[*B, 1]``: a reading of a time before the episode, or before the lag
+            window, is not observed.
+        age_key: age of the oldest state one step ago, in steps, ``[*B, 1]``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -202,23 +203,23 @@ class StateObservation(Wrapper, Update):
         return {self.predicted_key: self.run_inside({**entries, self._in_key: states}, call)[self._out_key], **written}
 
     def linearised(self, entries, call):
-        """Returns the Jacobian of the model, if it sees the present state alone."""
+        """Returns the Jacobian of the model, if it observes only the present state."""
         if self.state_dim is not None:
             return None
         found = linearise(self.module, {**entries, self._in_key: self.required(entries, self.ensemble_key)}, call)
         return None if found is None else ({self.predicted_key: found[0][self._out_key]}, *found[1:])
 
     def seen(self, entries: Entries, call: Call) -> tuple[Tensor, Tensor | None]:
-        """Returns the predicted observations ``[*B, E, O]``, and the mask of what is observed, if there is one."""
+        """Returns the predicted observations ``[*B, E, O]``, and the observed mask, if there is one."""
         written = run_module(self, entries, call)
         mask = entries.get(self.observed_key) if self.state_dim is None else written[unravel_key(self.out_keys[1])]
         return written[self.predicted_key], mask
 
     def _of_its_time(self, whole: Tensor, entries) -> tuple[Tensor, Tensor]:
-        """Returns the states ``[*B, E, S]`` that the reading belongs to, of ``[*B, E, L + 1, S]``, and the mask."""
+        """Returns the states ``[*B, E, S]`` at the reading's time, out of ``[*B, E, L + 1, S]``, and the mask."""
         observed, age = entries.get(self.observed_key), entries.get(self.age_key)
         check_mask(str(self.observed_key), observed)
-        if age is None:  # a call that learns shapes brings no age
+        if age is None:  # a call that infers shapes has no age
             age = torch.full_like(whole[..., 0, 0, :1], whole.shape[-2], dtype=torch.int64)
         late = None if self.late_key is None else entries.get(self.late_key)
         if late is None:
@@ -232,13 +233,13 @@ class StateObservation(Wrapper, Update):
 
 
 class JoinedObservation(SubModel):
-    """The predicted observations of several sensors side by side, and their masks.
+    """Concatenates the predicted observations of several sensors, and their masks.
 
     Args:
-        models: by name, in the order of the readings.
-        spaces: in which each reading lives; ``None`` for plain numbers.
-        predicted_key: ``[*B, E, O]``, the sum of all O.
-        observed_key: the mask ``[*B, O]``, on spaces of tangents.
+        models: observation models by name, in the order of the readings.
+        spaces: space of each reading; ``None`` for vectors.
+        predicted_key: predicted observations ``[*B, E, O]``, O the total dimension.
+        observed_key: mask ``[*B, O]``; on spaces, of tangents.
     """
 
     def __init__(
@@ -269,7 +270,7 @@ class JoinedObservation(SubModel):
         return self._joined([predicted for predicted, _ in pairs], [mask for _, mask in pairs])
 
     def linearised(self, entries, call):
-        """Returns their Jacobians below each other, where all are of plain numbers."""
+        """Returns the stacked Jacobians, if all readings are vectors."""
         given = [linearise(model, entries, call) for model in self.module.values()]
         found = [each for each in given if each is not None and is_flat(*each[2] or ())]
         if len(found) < len(given):
@@ -293,15 +294,15 @@ class JoinedObservation(SubModel):
 
 
 class JoinedReading(Sensor):
-    """The readings of several sensors side by side, and their noise.
+    """Concatenates the readings of several sensors, and their noise.
 
     Args:
         reading_keys: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose mean is taken.
         noise_keys: variances ``[*B, O]`` or covariances ``[*B, O, O]``, in the same order.
-        spaces: in which each reading lives; ``None`` for plain numbers.
+        spaces: space of each reading; ``None`` for vectors.
         observation_key: all readings, ``[*B, O]``.
         noise_key: all variances ``[*B, O]``, or one covariance ``[*B, O, O]`` if any sensor has one.
-        observation_dim: O of all, where it is known.
+        observation_dim: total O, if it is known.
 
     Example:
         >>> from tensordict import TensorDict
@@ -311,7 +312,7 @@ class JoinedReading(Sensor):
         tensor([1., 1., 0.])
     """
 
-    joins_readings = True  # without one of them it has nothing to say
+    joins_readings = True  # a reading that is left out leaves out this module
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Readings that come late, put where they belong: the steps since are made again, with the same noise."""
+"""Refiltering of delayed readings: repeats the steps since their measurement, with the same noise."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ __all__ = ["Refiltering", "RefilteringWindow"]
 
 
 class RefilteringWindow(NamedTuple):
-    """The last steps of a filter.
+    """Window of the last steps of a filter.
 
     Attributes:
-        rows: what each step read, with its noise and the readings that came later; the oldest first.
-        beliefs: the belief before the first of them, and what each wrote.
+        rows: inputs of each step, with its noise and the delayed readings of its time; the oldest first.
+        beliefs: belief before the first step, and the outputs of each step.
     """
 
     rows: tuple[TensorDictBase, ...]
@@ -38,28 +38,29 @@ class RefilteringWindow(NamedTuple):
 
 
 class Refiltering(Checked):
-    """Filters the last steps once more when a reading comes late, with any filter.
+    """Repeats the last steps when a delayed reading arrives, with any filter.
 
-    The belief is that of the filter which gets each reading when it is taken, to rounding, also for ensembles with
-    process noise and for particles: each step keeps the noise that it drew. A step without a late reading costs a step
-    of the filter, one with a reading of k steps ago k + 1. A :class:`FusedFilter` with a ``delay`` corrects the states
-    since by their covariances instead, at a cost that does not depend on how late the reading is; of an ensemble with
-    process noise they are sample covariances. That filter also runs as a policy and in a transform.
+    Up to rounding, the belief equals that of a filter with all readings in order, also for ensembles with process noise
+    and for particles, as each step keeps its noise. A step without a delayed reading costs one step of the filter, a
+    step with a reading of k steps ago costs k + 1. A :class:`FusedFilter` with a ``delay`` corrects the later states by
+    their covariances instead, at a cost independent of the delay; for an ensemble with process noise these are sample
+    covariances. That filter also runs as a policy and in a transform.
 
-    It is no :class:`Filter`, and goes around all others: ``Refiltering(Gated(FixedLag(filter, 10)), late, lag)``.
+    It is no :class:`Filter`, and must be the outermost wrapper: ``Refiltering(Gated(FixedLag(filter, 10)), late,
+    lag)``.
 
-    All rows of the batch begin their episode together. A reading is not used if it belongs to the time before the first
-    step, or to more than ``lag`` steps ago. It takes the place of what its sensor had read at that time.
+    All rows of the batch begin their episode together. A reading is not used if it was taken before the first step, or
+    more than ``lag`` steps ago. It replaces the sensor's previous reading of that time.
 
     Args:
-        filter: whose sensors have no ``delay`` of their own.
-        late: for each sensor that can be late the key of an entry ``[*B, 1]``, int64, by how many steps its reading
-            is; and the keys of what comes with the reading, the last of them its mask ``[*B, 1]`` or ``[*B, O]``.
-        lag: the largest number of steps by which a reading can be late.
+        filter: filter whose sensors have no ``delay``.
+        late: maps the key of each delayed sensor's latency in steps, ``[*B, 1]`` int64, to the keys of its reading and
+            other entries to move with it, the last of them its mask ``[*B, 1]`` or ``[*B, O]``.
+        lag: largest latency of a reading in steps.
 
     Raises:
         ValueError: if ``lag`` is not positive, the filter updates its first belief or has a sensor with a ``delay``, or
-            ``late`` names what the filter does not read, or no reading with its mask.
+            ``late`` names an entry that the filter does not read, or no reading with its mask.
 
     Example:
         >>> from tensordict import TensorDict
@@ -68,7 +69,7 @@ class Refiltering(Checked):
         >>> kf = KalmanFilter(one, one, process_noise_cov=one, noise_cov=one, mean=torch.zeros(1), cov=one)
         >>> late = Refiltering(kf, {"late": ("observation", "observed")}, lag=2)
         >>> drive = TensorDict({"observation": torch.tensor([[0.0], [0.0], [3.0], [5.0]])}, [4])
-        >>> drive["late"] = torch.tensor([[0], [0], [0], [2]])  # the last one was read two steps before, at t = 1
+        >>> drive["late"] = torch.tensor([[0], [0], [0], [2]])  # the last one was measured two steps before, at t = 1
         >>> drive["observed"] = torch.tensor([[False], [False], [True], [True]])
         >>> order = TensorDict({"observation": torch.tensor([[0.0], [5.0], [3.0], [0.0]])}, [4])
         >>> order["observed"] = torch.tensor([[False], [True], [True], [False]])
@@ -92,7 +93,7 @@ class Refiltering(Checked):
         """Returns the window at the start of an episode: no steps yet, and the initial belief.
 
         Args:
-            row: what :meth:`Filter.initialise` reads, ``[*B]``.
+            row: inputs of :meth:`Filter.initialise`, ``[*B]``.
 
         Returns:
             The window, whose ``belief`` is the initial one.
@@ -104,15 +105,15 @@ class Refiltering(Checked):
 
         Args:
             window: the last steps; it is not changed.
-            row: what :meth:`Filter.step` reads, ``[*B]``, besides the belief.
+            row: inputs of :meth:`Filter.step`, ``[*B]``, besides the belief.
 
         Returns:
             The window with this step, whose ``belief`` is that of t.
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if a module can draw its noise only within the step, the row begins another episode, or an entry
-                of ``late`` is not of whole numbers ``[*B, 1]``.
+            ValueError: if a module draws its noise only within the step, the row begins another episode, or an entry of
+                ``late`` is no integer tensor ``[*B, 1]``.
         """
         row = self.filter.of_one_robot(row)
         begins = starts_of(row, self.filter.init_key, step=True)
@@ -128,7 +129,7 @@ class Refiltering(Checked):
         return RefilteringWindow(tuple(rows), tuple(beliefs))
 
     def sequence(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Filters one episode ``[*B, T]`` and writes what each step wrote when it was made first.
+        """Filters one episode ``[*B, T]`` and writes the outputs of each step before later corrections.
 
         Raises:
             ValueError: if another episode begins within it.
@@ -158,7 +159,7 @@ class Refiltering(Checked):
         return row
 
     def _place(self, rows: list[TensorDictBase]) -> int:
-        """Puts the late readings of the last row where they belong; returns the first row that is another."""
+        """Moves the delayed readings of the last row to their rows of measurement; returns the first changed row."""
         last = len(rows) - 1
         first = last
         for key, keys in self.late.items():
@@ -188,7 +189,7 @@ def _read_with(key: NestedKey, keys: Sequence[NestedKey], filter: Filter) -> tup
 
 
 def _check_late(key: NestedKey, late: Tensor, row: TensorDictBase) -> None:
-    """Raises unless an entry says by how many steps a reading is late."""
+    """Raises unless an entry is a latency in whole steps."""
     check_shape(str(key), late, (*row.batch_size, 1), "[*B, 1]")
     if late.is_floating_point() or late.dtype == torch.bool:
         raise ValueError(f"{key!r} holds steps, as int64; got {late.dtype}. Pass {key}.long().")

@@ -1,4 +1,4 @@
-"""One sensor of a filter of several: its model, noise, mask and delay, and its modules under keys of their own."""
+"""Sensor of a fused filter: its model, noise, mask and delay, and its modules with keys of their own."""
 
 from __future__ import annotations
 
@@ -23,31 +23,29 @@ __all__ = ["FusedSensor", "Wired", "noise_key_of", "wire"]
 class FusedSensor(Checked):
     """One sensor of a :class:`FusedFilter`.
 
-    The keys of its modules need not be chosen: what they write is put under ``("sensor", NAME, ...)``.
+    The keys of its modules need not be unique: their outputs are moved to ``("sensor", NAME, ...)``.
 
     Attributes:
-        observation: h, what the sensor would read in a state: :class:`~torch_denkf.modules.Select`,
+        observation: observation model h: :class:`~torch_denkf.modules.Select`,
             :class:`~torch_denkf.modules.LinearObservation`, :class:`~torch_denkf.modules.LearnedObservation`.
-        noise: R: standard deviations ``[O]``; a module that writes variances ``[*B, O]``; or the key of an entry of the
-            data with the variances of each reading, or, for a mean and a covariance, its covariance ``[*B, O, O]``.
-        sensor: a module that reads frames and writes the reading, such as an image sensor; ``None`` where the reading
-            is in the data.
-        observation_key: its key in the data, ``[*B, O]``; by default the sensor's name.
-        observed_key: its mask, ``[*B, 1]`` or ``[*B, O]``, True where there is a reading; by default NAME_observed. A
-            sensor with a lower rate than the filter's has it True in every n-th step. It is the mask of the *data*:
-            where ``sensor`` makes a further one of it, as :class:`~torch_denkf.monitoring.BlackIsMissing` does, the
-            update reads that one by itself.
-        delay: by how many steps its readings come late. Each then corrects the state that it belongs to, and through
-            the covariances all since.
-        late_key: an entry ``[*B, 1]``, int64, that says it for each reading, 0 to ``delay``, where delays vary.
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` for plain numbers. R is
-            of tangents.
-        features_key: an entry ``[*B, F]`` that tells how good a reading is, for the filter's ``weights``: one of the
-            data, or one that ``sensor`` writes, such as its encoding, under the sensor's own key.
-        analysis: makes the sensor's own update, see :class:`FusedFilter`; ``None`` for the filter's.
-        sensor_error: coloured errors of the sensor, :class:`~torch_denkf.imperfect.FadingBias`: they become part of the
-            state, behind its S components and the errors of the sensors before this one. All else is given for the S
-            components alone. A constant offset is one with a ``time`` far beyond that of the recordings.
+        noise: R: standard deviations ``[O]``; a module that writes variances ``[*B, O]``; or the key of an entry with
+            the variances of each reading, or, for a mean and a covariance, its covariance ``[*B, O, O]``.
+        sensor: module that computes the reading from frames, such as an image sensor; ``None`` if the reading is in the
+            data.
+        observation_key: key of the reading in the data, ``[*B, O]``; by default the sensor's name.
+        observed_key: key of the observed mask in the data, ``[*B, 1]`` or ``[*B, O]``; by default NAME_observed. For a
+            sensor at a lower rate than the filter's it is True in every n-th step. If ``sensor`` derives another mask
+            from it, like :class:`~torch_denkf.monitoring.BlackIsMissing`, the update uses the derived mask.
+        delay: latency of the readings in steps. Each then corrects the state at its time, and through the covariances
+            all later ones.
+        late_key: for varying delays, the key of each reading's latency, ``[*B, 1]`` int64, 0 to ``delay``.
+        reading_space: space of the reading, such as ``Circle()`` for an angle; ``None`` for vectors. R is of tangents.
+        features_key: key of features ``[*B, F]`` of a reading's quality, for the filter's ``weights``: an entry of the
+            data, or an output of ``sensor``, such as its encoding, under the sensor's own key.
+        analysis: constructor of this sensor's update, see :class:`FusedFilter`; ``None`` for the filter's.
+        sensor_error: coloured errors of the sensor, :class:`~torch_denkf.imperfect.FadingBias`: they augment the state
+            after its S components and the errors of previous sensors. All other arguments are for the S components
+            only. A constant offset is an error with a ``time`` far longer than the recordings.
     """
 
     observation: TensorDictModuleBase
@@ -65,7 +63,7 @@ class FusedSensor(Checked):
 
 @dataclass(frozen=True)
 class Wired:
-    """A sensor's modules under keys of their own, and those keys."""
+    """Modules of a sensor with keys of their own, and these keys."""
 
     modules: dict[str, TensorDictModuleBase]
     reading: NestedKey
@@ -75,14 +73,14 @@ class Wired:
 
 
 def noise_key_of(sensor: FusedSensor) -> NestedKey | None:
-    """Returns the key under which the data have the noise of each reading; ``None`` where they do not."""
+    """Returns the key of each reading's noise in the data; ``None`` if it is not in the data."""
     noise = sensor.noise
     named = isinstance(noise, str) or (isinstance(noise, tuple) and all(isinstance(part, str) for part in noise))
     return unravel_key(noise) if named else None
 
 
 def wire(name: str, sensor: FusedSensor) -> Wired:
-    """Puts what a sensor's modules write under ``("sensor", name, ...)``."""
+    """Moves the outputs of a sensor's modules to ``("sensor", name, ...)``."""
     reading = unravel_key(name if sensor.observation_key is None else sensor.observation_key)
     observed = unravel_key(f"{name}_observed" if sensor.observed_key is None else sensor.observed_key)
     names: dict[NestedKey, NestedKey] = {"observed": observed}

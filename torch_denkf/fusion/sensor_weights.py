@@ -1,4 +1,4 @@
-r"""Learned weights between sensors: how much each reading counts, from its features and its innovation."""
+r"""Learned weights of sensors, computed from features and innovations of their readings."""
 
 from __future__ import annotations
 
@@ -23,44 +23,43 @@ __all__ = ["SensorAttention", "SensorWeights", "WeightedNoise"]
 
 
 class SensorAttention(nn.Module):
-    r"""Attention between sensors: a weight in (0, 1) for each, 1 before training up to 2 %.
+    r"""Computes a weight in (0, 1) for each sensor by attention; before training it is 1 up to 2 %.
 
-    Sensor m's token holds its innovation in standard deviations of what the filter expects,
-    :math:`e_m = (y_m - h_m(\bar x)) / \sqrt{\mathrm{Var}\,h_m(X) + R_m}`, and its features :math:`\varphi_m`. The
-    tokens of the sensors that are observed look at each other; the weight follows from a token and what it saw:
+    The token of sensor m contains its innovation in standard deviations, :math:`e_m = (y_m - h_m(\bar x)) /
+    \sqrt{\mathrm{Var}\,h_m(X) + R_m}`, and its features :math:`\varphi_m`. The tokens of observed sensors attend to
+    each other; the weight is computed from a token and its context:
 
     .. math::
         z_m &= f_m(e_m, \log(1 + e_m^2), \varphi_m), \quad
         c_m = \sum_n \mathrm{softmax}_n\!\left(\frac{(W_q z_m)^T W_k z_n}{\sqrt D}\right) W_v z_n \\
         w_m &= w_0 + (1 - w_0)\,\sigma(g(z_m, c_m) + 4 - a_m \log(1 + \overline{e_m^2}))
 
-    So a sensor is judged by how well it agrees with the forecast, and by what the others say at the same time. The
-    filter divides R by the weight: a reading of weight 0.01 counts as one with ten times the standard deviation.
+    A sensor's weight thus depends on its agreement with the forecast, and on the other sensors' readings of the same
+    time. The filter divides R by the weight: a weight of 0.01 means ten times the standard deviation.
 
-    It learns only what its recordings show. Put the failures that you fear into them. In some windows leave a sensor
-    out, so that the others learn to do without it. A window must hold several readings of the slowest sensor: of
-    a GPS at 1 Hz one second shows nothing. The belief that a window starts from must be as wrong as it says. A filter
-    that starts far off learns to believe whatever pulls it back. Good features are in the sensor's standard deviations,
-    such as by how much its last readings differ, and how many of them are exactly the same.
+    It learns only from failures in its recordings: add the expected ones. Leave a sensor out of some windows, so that
+    the others learn to do without it. A window must contain several readings of the slowest sensor: for a GPS at 1 Hz
+    one second is too short. The initial belief of a window must be consistent: a filter that starts with a large error
+    learns to trust any reading that corrects it. Useful features are the spread of the sensor's last readings, in its
+    standard deviations, and the number of equal readings.
 
     Args:
         observations: O of each sensor, by name, in the order of the filter's sensors.
-        features: number of features of each sensor that has any.
-        size: D, of a token.
-        floor: :math:`w_0`, the smallest weight. It keeps a way back: a sensor that was distrusted still corrects
-            the belief a little. A thousand readings of weight 0.001 count as one of full weight: where a sensor reads
-            much more often than the others, or is much more exact, take a smaller one.
-        slope: a, before training; 0 leaves the term out. A filter that has followed a sensor finds nothing wrong with
-            it any more, and a loss does not tell how it could have known. With a slope of 2 a reading three standard
-            deviations off has a weight of a third before training, one ten off a weight of 0.005.
+        features: number of features of each sensor with features.
+        size: D, size of a token.
+        floor: :math:`w_0`, the smallest weight. A sensor with this weight still corrects the belief a little, so that
+            it can recover. A thousand readings of weight 0.001 count as one of full weight: use a smaller floor if a
+            sensor has a much higher rate or precision than the others.
+        slope: a, before training; 0 leaves the term out. A filter that has followed a faulty sensor has small
+            innovations, from which a loss cannot teach the weights. With a slope of 2, a reading with an innovation of
+            three standard deviations has a weight of a third before training, one with ten has a weight of 0.005.
 
     Raises:
         ValueError: if a size is not positive, the floor is outside (0, 1), or features are of no sensor.
 
-    Reference:
-        After the attention gain of Liu, Zhou, Ikemoto, Ben Amor, "alpha-MDF: an attention-based multimodal
+    Reference: Based on the attention gain of Liu, Zhou, Ikemoto, Ben Amor, "alpha-MDF: an attention-based multimodal
         differentiable filter for robot state estimation", CoRL 2023. There attention replaces the Kalman gain; here it
-        scales the noise, so that the update stays that of the filter.
+        scales the noise, and the filter's update does not change.
 
     Example:
         >>> attention = SensorAttention({"camera": 2, "wheel": 1})
@@ -105,22 +104,22 @@ class SensorAttention(nn.Module):
         """Returns the weights.
 
         Args:
-            innovations: of each sensor in standard deviations, ``[*B, O]``; 0 where not observed.
-            observed: which sensors are, ``[*B, M]``.
-            features: of the sensors that have any, ``[*B, F]``.
+            innovations: innovation of each sensor in standard deviations, ``[*B, O]``; 0 if not observed.
+            observed: mask of observed sensors, ``[*B, M]``.
+            features: features of the sensors that have any, ``[*B, F]``.
 
         Returns:
             ``[*B, M]``, in the order of the sensors.
         """
         tokens = []
         for name in self.names:
-            # Bounded slowly, not cut off: there is a gradient however wrong a reading is.
+            # asinh compresses instead of clamping, so that outliers have a gradient, too.
             value = innovations[name].asinh()
             parts = [value, innovations[name].square().log1p()]
             tokens.append(self.embed[name](torch.cat([*parts, *([features[name]] if name in features else [])], -1)))
         token = torch.stack(tokens, -2)
         match = self.query(token) @ self.key(token).mT / math.sqrt(token.shape[-1])
-        # A sensor always sees itself, so that there is something to see where nothing is observed.
+        # A sensor always attends to itself, so that the softmax is finite if nothing is observed.
         seen = observed.unsqueeze(-2) | torch.eye(len(self.names), dtype=torch.bool, device=observed.device)
         context = match.masked_fill(~seen, -torch.inf).softmax(-1) @ self.value(token)
         score = self.score(torch.cat([token, context], -1)).squeeze(-1)
@@ -131,23 +130,23 @@ class SensorAttention(nn.Module):
 
 
 class SensorWeights(Sensor):
-    """The weights of all sensors in the forecast, before any of them corrects it.
+    """Computes the weights of all sensors from the forecast, before any update.
 
-    :class:`torch_denkf.fusion.FusedFilter` makes it.
+    :class:`torch_denkf.fusion.FusedFilter` adds it.
 
     Args:
-        network: innovations, masks and features to weights, e.g. :class:`SensorAttention`.
-        models: the sensors' observation models in the forecast, by name.
+        network: maps innovations, masks and features to weights, e.g. :class:`SensorAttention`.
+        models: observation models of the sensors, by name.
         readings: readings ``[*B, O]``, or samples ``[*B, E, O]``.
         noises: variances ``[*B, O]`` or covariances ``[*B, O, O]``.
         features: entries ``[*B, F]`` of the sensors that have any.
-        spaces: in which each reading lives, of numbers and angles; ``None`` for plain numbers.
-        state_key: the forecast's ensemble; or, with ``moments``, where its sigma points are put.
+        spaces: space of each reading, of vectors and angles; ``None`` for vectors.
+        state_key: the forecast's ensemble; with ``moments``, key for its sigma points.
         moments: prefix of the forecast's ``mean`` and ``cov``; ``None`` for an ensemble.
         weight_key: prefix of the weights ``[*B, 1]``, by the sensors' names.
     """
 
-    joins_readings = True  # without one of them it has nothing to say
+    joins_readings = True  # a reading that is left out leaves out this module
 
     def __init__(
         self,
@@ -210,13 +209,13 @@ class SensorWeights(Sensor):
 
 
 class WeightedNoise(Sensor):
-    """A sensor's noise, divided by the sensor's weight.
+    """Divides a sensor's noise by its weight.
 
     Args:
         noise_key: variances ``[*B, O]`` or a covariance ``[*B, O, O]``.
-        weight_key: ``[*B, 1]``.
-        out_key: like the noise.
-        observation_dim: O, where it is known.
+        weight_key: weight ``[*B, 1]``.
+        out_key: scaled noise, of the same shape.
+        observation_dim: O, if it is known.
 
     Example:
         >>> from tensordict import TensorDict
@@ -232,15 +231,15 @@ class WeightedNoise(Sensor):
         self.observation_dim = observation_dim
 
     def compute(self, variance, weight):
-        """Returns the larger noise."""
+        """Returns the scaled noise."""
         return variance / (weight if variance.ndim == weight.ndim else weight.unsqueeze(-1))
 
 
 def _points(mean: Tensor, cov: Tensor, size: int) -> Tensor:
-    """Returns members ``[*B, 2 S, N S]`` of that mean, in which each of N states has its sample covariance.
+    """Returns sigma points ``[*B, 2 S, N S]`` with the given mean and the covariance of each of N states.
 
-    How the states belong together is left out: each sensor observes one of them, and the covariance of all may be as
-    good as singular.
+    Covariances between the states are ignored: each sensor observes one state, and the joint covariance may be almost
+    singular.
     """
     blocks = cov.unflatten(-1, (-1, size)).unflatten(-3, (-1, size)).diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
     roots = semidefinite_root(blocks).mT.movedim(-3, -2).flatten(-2) * math.sqrt(size - 0.5)

@@ -1,4 +1,4 @@
-"""Imperfect sensors: occlusion, coloured errors, outliers, readings that cannot be true."""
+"""Imperfect sensors: occlusion, coloured errors, outliers, invalid readings."""
 
 from torch_denkf.imperfect.bias import FadingBias
 from torch_denkf.imperfect.contaminated import Contaminated

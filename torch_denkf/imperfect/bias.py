@@ -1,16 +1,16 @@
-r"""A sensor's slow errors as part of the state: biases that fade, in any filter.
+r"""State augmentation by fading biases for coloured errors of a sensor, in any filter.
 
-A sensor that reads wrongly often reads wrongly in the next frame, too. A filter that takes such errors for white noise
-averages them out with each frame, and its intervals become too narrow. Here the state is :math:`(x, b)`: S numbers of
-the system, then K biases of the sensor, each an Ornstein-Uhlenbeck process with its own standard deviation and its own
-time; the reading is :math:`h(x) + b`. With several times for each component of the reading the errors may be slow and
-slower.
+Errors of a sensor are often correlated in time. A filter that assumes white noise is then overconfident. Here the state
+is :math:`(x, b)`: S numbers of the system, then K biases of the sensor, each an Ornstein-Uhlenbeck process with its own
+standard deviation and time constant; the reading is :math:`h(x) + b`. A component of the reading may have several
+biases, with different time constants.
 
 .. math:: b_t = \rho \circ b_{t-1} + \eta_t, \quad \rho = e^{-1 / \tau}, \quad \eta_t \sim N(0, \sigma^2 (1 - \rho^2))
 
-``sensor_error=FadingBias(...)`` of a filter does it. By hand, give transition, process noise and observation
-the same :class:`FadingBias`, and the initial belief S + K dimensions: ``FadingBias.std`` for the biases. For a linear
-system with such "coloured" reading errors the filter then is the optimal one: the Kalman filter of the augmented state.
+The option ``sensor_error=FadingBias(...)`` of a filter does this. Otherwise, give transition, process noise and
+observation the same :class:`FadingBias`, and the initial belief S + K dimensions: ``FadingBias.std`` for the biases.
+For a linear system with such "coloured" reading errors the filter then is the optimal one: the Kalman filter of the
+augmented state.
 
 Source: Bryson & Henrikson 1968, J. Spacecraft Rockets 5 ("Estimation using sampled data containing sequentially
 correlated noise"); Uhlenbeck & Ornstein 1930.
@@ -41,13 +41,13 @@ __all__ = ["BiasedBelief", "BiasedNoise", "BiasedObservation", "BiasedTransition
 
 
 class FadingBias(nn.Module):
-    """K biases that fade: Ornstein-Uhlenbeck processes, whose size and time are learned.
+    """K fading biases: Ornstein-Uhlenbeck processes with learned standard deviations and time constants.
 
     Args:
-        std: standard deviation of each bias in the long run ``[K]``, in the reading's units, before training.
-        time: steps in which each bias fades to 1/e, ``[K]`` or one number for all, before training.
+        std: initial value of the stationary standard deviation of each bias ``[K]``, in the reading's units.
+        time: initial value of the time constant of each bias in steps, ``[K]`` or one number for all.
         trainable: whether both are parameters; else buffers.
-        factor: whether they are errors of a factor: the reading is :math:`h(x) (1 + b)`, and ``std`` has no unit.
+        factor: whether the errors are multiplicative: the reading is :math:`h(x) (1 + b)`, and ``std`` has no unit.
 
     Raises:
         ValueError: if a standard deviation or a time is not positive.
@@ -85,20 +85,20 @@ class FadingBias(nn.Module):
     def from_residuals(
         cls, residuals: Tensor, *, trainable: bool = True, per_run: bool = False
     ) -> tuple[FadingBias, Tensor]:
-        r"""Returns the biases that explain how long a sensor's errors last, and what is left: white noise.
+        r"""Fits biases to the autocorrelation of a sensor's errors, and returns them with the remaining white noise.
 
         The autocovariance of :math:`b + w` at lag k is :math:`\sigma^2 e^{-k / \tau}`, and at lag 0 it is more by the
-        white variance. Size and time are those of the least squares over lags of one step and more, each lag counted
-        by its pairs, up to three times :math:`\tau`. Errors that last longer than the runs are taken for ones that last
-        as long.
+        white variance. Standard deviation and time constant are fitted by least squares over lags from one step to
+        three times :math:`\tau`, weighted by the number of pairs. The time constant is bounded by the length of the
+        runs.
 
         Args:
-            residuals: reading minus what it should have been, ``[N, T, K]``, N runs of T steps, on data that the sensor
-                was not trained on; NaN where there is none. Their mean is not taken off.
+            residuals: reading minus true value, ``[N, T, K]``, N runs of T steps, on held-out data; NaN for missing
+                values. Their mean is not subtracted.
             trainable: see the class.
-            per_run: whether the errors also have a part that is the same for a whole run, as those of a learned sensor
-                in new surroundings have. There are then 2 K biases, K that last 100 times as long as a run and K that
-                fade. It takes about ten runs. One time for both kinds fits neither.
+            per_run: whether the errors also have a constant part in each run, as for a learned sensor in new
+                surroundings. There are then 2 K biases, K that last 100 times as long as a run and K that fade. It
+                takes about ten runs. One time for both kinds fits neither.
 
         Returns:
             K biases, or 2 K; and the standard deviations of the white part ``[K]``, for the noise of the reading.
@@ -135,17 +135,17 @@ class FadingBias(nn.Module):
 
     @property
     def std(self) -> Tensor:
-        """Returns standard deviations in the long run ``[K]``: of the biases in an initial belief."""
+        """Returns stationary standard deviations ``[K]``, also those of the initial belief."""
         return self.log_std.exp()
 
     @property
     def decay(self) -> Tensor:
-        """Returns the share of a bias that is left after a step, ``[K]``."""
+        """Returns the decay factor of a bias per step, ``[K]``."""
         return (-(-self.log_time).exp()).exp()
 
     @property
     def variance(self) -> Tensor:
-        """Returns the variance of what is new in a step, ``[K]``: with it the biases stay as large as they are."""
+        """Returns the variance of the process noise, ``[K]``, that keeps the biases stationary."""
         return (2 * self.log_std).exp() * -torch.expm1(-2 * (-self.log_time).exp())
 
     def augmented(
@@ -156,7 +156,7 @@ class FadingBias(nn.Module):
         initial: TensorDictModuleBase,
         reading_space: Space | None = None,
     ) -> tuple[BiasedTransition, BiasedObservation, BiasedNoise, BiasedBelief]:
-        """Gives each part of a filter the same biases.
+        """Augments each part of a filter by the same biases.
 
         Args:
             transition: moves ensembles of the state.
@@ -223,7 +223,7 @@ class FadingBias(nn.Module):
 
 
 class BiasedTransition(Wrapper, Transition):
-    """A transition of S numbers, and behind them biases that fade.
+    """Augments a transition of S components by fading biases.
 
     Args:
         transition: moves ensembles ``[*B, E, S]``; its keys are kept, its noise too.
@@ -434,7 +434,7 @@ class BiasedBelief(AroundInitial):
 
 
 def _autocovariance(values: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns means of products of values ``[N, T]`` that lie 0, 1, ... steps apart, and how many there are."""
+    """Returns means of products of values ``[N, T]`` at lags 0, 1, ... and their counts."""
     values, steps = torch.where(known, values, 0), values.shape[1]
     products, counts = [], []
     for lag in range(min(steps, 1000)):
@@ -478,7 +478,7 @@ def _fit(covariance: Tensor, count: Tensor, component: int, per_run: bool) -> tu
 def _linearised(
     wrapper: Wrapper, bias: FadingBias, entries: Entries, inside: Call
 ) -> tuple[Entries, Tensor, Tensor] | None:
-    """Returns what the module inside writes, its Jacobian by the state alone, and the biases; ``None`` if not known."""
+    """Returns the inside module's outputs, its Jacobian by the state, and the biases; ``None`` if not known."""
     key = unravel_key(wrapper.in_keys[0])
     state, slow = _split(wrapper.required(entries, key), bias, wrapper)
     found = linearise(wrapper.module, {**entries, key: state}, inside)

@@ -1,9 +1,9 @@
-r"""Readings of which a share is wrong: an update under a contaminated Gaussian likelihood.
+r"""Update under a contaminated Gaussian likelihood, in which a share of the readings are outliers.
 
 .. math:: p(y \mid x) = (1 - \epsilon)\, N(y; h(x), R) + \epsilon\, N(y; h(x), W)
 
 with :math:`\epsilon` the share of outliers, and W their noise, :math:`w^2 R` or given. For a Gaussian forecast the
-posterior is a mixture of two: the update with R, and the update with W, each counted by its evidence.
+posterior is a mixture of two: the update with R, and the update with W, weighted by their evidence.
 
 Source: the contaminated Gaussian: Tukey 1960 ("A survey of sampling from contaminated distributions"); Box & Tiao 1968,
 Biometrika 55. Its filter, with one Gaussian for the mixture: Alspach & Sorenson 1972, IEEE Trans. Automatic Control 17
@@ -45,10 +45,10 @@ _DIVERGED = 3.0  # times as wide as the forecast says
 
 
 class Contaminated(MixedUpdate):
-    r"""Takes a reading for an outlier with a probability: an update under a contaminated Gaussian likelihood.
+    r"""Wraps an analysis: update under a contaminated Gaussian likelihood.
 
-    The analysis runs twice, with the noise R and with the noise W of outliers. With q, the probability that the reading
-    is an outlier now that it is known, the belief is the mixture, of 1 - q times the first and q times the second:
+    The analysis runs twice, with the noise R and with the noise W of outliers. With the posterior probability q that
+    the reading is an outlier, the belief is the mixture of the first, weighted by 1 - q, and the second, weighted by q:
 
     =====================  =============================================================================================
     belief                 posterior
@@ -56,12 +56,13 @@ class Contaminated(MixedUpdate):
     mean and covariance    the mixture's, that of both means' distance included; on a space those of the tangents at the
                            forecast's mean. For a linear Gaussian system that is the exact posterior's
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a lag window that is corrected, too
     particles              the exact posterior: each particle's likelihood is the mixture. The analysis runs three times
     =====================  =============================================================================================
 
     A share of 0 is the analysis alone, bit for bit; a share of 1 with a large W is a missing observation. A reading is
-    an outlier as a whole: give components that fail apart a sensor each, :class:`~torch_denkf.fusion.FusedFilter`.
+    an outlier as a whole: components with independent outliers need a sensor each,
+    :class:`~torch_denkf.fusion.FusedFilter`.
 
     ``(info_prefix, "log_likelihood")`` is that of the mixture, so that the term ``nll`` of the losses learns share and
     width without true states. ``(info_prefix, "outlier")`` ``[*B, 1]`` is q, 0 where nothing is observed. ``nis`` is
@@ -75,11 +76,11 @@ class Contaminated(MixedUpdate):
         analysis: of an ensemble, of a mean and a covariance, or of particles with a Gaussian likelihood. Its keys and
             its noise are kept.
         share: :math:`\epsilon` in [0, 1], ``[*B, 1]`` in an entry.
-        width: w, by how much outliers are wider than R says, ``[*B, 1]`` in an entry.
-        noise: W, in the place of ``width``: standard deviations ``[O]``; in an entry variances ``[*B, O]``.
-        divergence: probability that the filter has diverged, 0.01 for example: a sound reading then is expected from a
+        width: w, factor on the standard deviations of R for outliers, ``[*B, 1]`` in an entry.
+        noise: W, instead of ``width``: standard deviations ``[O]``; in an entry variances ``[*B, O]``.
+        divergence: probability that the filter has diverged, 0.01 for example: a good reading then is expected from a
             forecast of three times the standard deviations. One Gaussian for a mixture forgets the smaller peak; where
-            that was the true one, it may take many sound readings for outliers. It costs a third run.
+            that was the true one, it may take many good readings for outliers. It costs a third run.
         trainable: whether those that are numbers are parameters: the logit of the share, logarithms of the others.
 
     Raises:
@@ -159,7 +160,7 @@ class Contaminated(MixedUpdate):
         return {"": self.module, **heads}
 
     def reading_dims(self, entries, call):
-        """Returns how many numbers each of ``reading_keys`` has, as the analysis says."""
+        """Returns the sizes of ``reading_keys`` in the analysis."""
         dims = [*self.module.reading_dims(entries, call)][: len(self.reading_keys)]
         return [*dims, *(dims[-1] if name == "noise" else 1 for name in self.said_by_entries.values())]
 
@@ -188,11 +189,11 @@ class Contaminated(MixedUpdate):
         return {**out, **both, (self.info_prefix, "outlier"): outlier}
 
     def _run(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        """Returns the outputs of the analysis; an ensemble's predictions and reading are vectors already."""
         return (self.module.on_aligned if self.kind == "members" else self.module.on_entries)(entries, call)
 
     def _of_sound(self, entries: Entries, call: Call, seen: Tensor | None) -> Entries:
-        """Returns what the analysis writes with R, of the forecast and of the one that has diverged."""
+        """Returns the outputs of the analysis with R, of the forecast and of the one that has diverged."""
         out = self._run(entries, call)
         if not self.divergence:
             return out
@@ -252,7 +253,7 @@ class Contaminated(MixedUpdate):
 
 
 class _Quantity(nn.Module):
-    """Numbers that are given or trained, an entry, or what a module writes.
+    """A quantity that is a constant, a parameter, an entry, or the output of a module.
 
     Args:
         name: for messages, and of the place of the module's noise.

@@ -1,4 +1,4 @@
-"""Updates whose posterior is a mixture of two beliefs, and what they share: moments, members and draws of both."""
+"""Base of updates whose posterior is a mixture of two beliefs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["MixedUpdate", "kind_of_update", "wider_forecast", "wider_past", "wit
 
 
 class MixedUpdate(Around):
-    """Goes around an update, and replaces a mixture of two beliefs by one that has its mean and its covariance.
+    """Wraps an update, and replaces a mixture of two beliefs by one belief with its mean and covariance.
 
     Attributes:
         kind: of the belief, see :func:`kind_of_update`.
@@ -36,12 +36,12 @@ class MixedUpdate(Around):
 
         Args:
             entries: with the forecast.
-            probability: of the first before the reading is known, ``[*B, 1]``. With 1 the first belief comes out, and
-                with 0 the second, without rounding.
-            share: that after the reading is known.
-            out: what the update wrote, the first belief.
+            probability: prior probability of the first, ``[*B, 1]``. With 1 the result is exactly the first belief, and
+                with 0 the second.
+            share: posterior probability of the first.
+            out: the outputs of the update, the first belief.
             other: the second, under the keys of ``out``.
-            seen: where anything is observed, ``[*B, 1]``; elsewhere the first belief comes out. ``None``: everywhere.
+            seen: mask of elements with an observation, ``[*B, 1]``; the others get the first belief. ``None`` for all.
         """
         first = probability >= 1 if seen is None else (probability >= 1) | ~seen
         mix = self._mixed_moments if self.kind == "moments" else self._mixed_members
@@ -72,10 +72,10 @@ class MixedUpdate(Around):
         return {**mixed, keys[2]: mixed[keys[1]].diagonal(dim1=-2, dim2=-1)}
 
     def _mixed_members(self, entries: Entries, never: Tensor, share: Tensor, out: Entries, other: Entries) -> Entries:
-        """Returns ensemble, mean and variances; a past, and a covariance, where the analysis writes them."""
+        """Returns ensemble, mean and variances; a lag window, and a covariance, where the analysis writes them."""
         analysis, space, batch = self.module, self.space, len(share.shape) - 1
         pairs = [(analysis.in_keys[0], analysis.out_keys[0])]
-        pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # the past is corrected in place
+        pairs += [(key, key) for key in analysis.in_keys if key in analysis.out_keys]  # lag window, in place
         first, second = ([belief[key] for _, key in pairs] for belief in (out, other))
         if space is not None:
             centers = [_center(space, entries[key], batch) for key, _ in pairs]
@@ -100,7 +100,7 @@ def kind_of_update(analysis: Update, name: str) -> str:
     """Returns the kind of belief that an analysis updates: ``"members"``, ``"moments"`` or ``"particles"``.
 
     Raises:
-        TypeError: if the analysis does not say where its forecast and its reading are; ``name`` is the wrapper's.
+        TypeError: if the keys of the forecast and the reading of the analysis are unknown; ``name`` is the wrapper's.
     """
     wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
     if isinstance(analysis, Update) and not wrapped and analysis.info_prefix is not None:
@@ -141,7 +141,7 @@ def wider_forecast(analysis: Update, entries: Entries, factor: Tensor, *, member
 
 
 def wider_past(analysis: Update, entries: Entries, factor: Tensor) -> Entries:
-    """Returns the entries with the past of a :class:`LaggedAnalysis` spread likewise: a reading may be of that."""
+    """Returns the entries with the lag window of a :class:`LaggedAnalysis` spread likewise."""
     if not isinstance(analysis, LaggedAnalysis):
         return entries
     key, space = analysis.in_keys[-1], analysis.space
@@ -200,7 +200,7 @@ def _like(mask: Tensor, value: Tensor) -> Tensor:
 
 
 def _center(space: Space, members: Tensor, batch: int) -> Tensor:
-    """Returns a point ``[*B, 1, P]`` near members ``[*B, E, P]``, or one for each time of a past ``[*B, E, L, P]``."""
+    """Returns a point ``[*B, 1, P]`` near members ``[*B, E, P]``, or one per time of a lag window ``[*B, E, L, P]``."""
     if members.ndim == batch + 2:
         return space.near(members).unsqueeze(-2)
     return space.near(members.movedim(-3, -2)).unsqueeze(-3)

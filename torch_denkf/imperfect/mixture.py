@@ -1,12 +1,12 @@
-r"""A reading that may be about something else: the mixture of two beliefs, and what speaks for each.
+r"""Mixture of two beliefs, for a reading that may not be about the state, and their responsibilities.
 
-With the probability p the reading is about the state, :math:`y \sim N(h(x), S)`; with 1 - p it is anything, :math:`y
-\sim b`. The belief then is a mixture: with the share
+With the probability p the reading is about the state, :math:`y \sim N(h(x), S)`; with 1 - p about something else,
+:math:`y \sim b`. The belief then is a mixture: with the responsibility
 
 .. math:: q = \frac{p N(y)}{p N(y) + (1 - p) b(y)}
 
-of what the update makes of the reading, and with 1 - q of the forecast. Here it is replaced by what has its mean and
-its covariance.
+as the weight of the updated belief, and 1 - q that of the forecast. It is approximated by a belief with the same mean
+and covariance.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _RIDGE = 1e-12
 
 
 def responsibility(probability: Tensor, log_own: Tensor, log_other: Tensor) -> Tensor:
-    """Returns the probability that the reading was about the state, now that it is known.
+    """Returns the posterior probability that the reading is about the state.
 
     Args:
-        probability: p, before the reading is known, in [0, 1].
-        log_own: log-density of the reading if it is, ``log N(y)``.
-        log_other: if it is not, ``log b(y)``.
+        probability: prior probability p, in [0, 1].
+        log_own: log-density of a reading about the state, ``log N(y)``.
+        log_other: log-density of another reading, ``log b(y)``.
 
     Returns:
         q, of the same shape; 1 for p = 1 and 0 for p = 0, without a gradient there.
@@ -93,8 +93,8 @@ def mix_members(share: Tensor, members: Tensor, other: Tensor) -> Tensor:
     :math:`\Delta` the ways, E x S. The anomalies :math:`A_0` are therefore multiplied by :math:`L_0^{-T} L^T`, with
     :math:`L_0 L_0^T = A_0^T A_0` and L the factor of what is to come out: :math:`A^T A = L L^T`. That asks for at most
     E - 1 directions in which the members differ, as updates without localisation leave them; where there are more, the
-    ensemble cannot hold the mixture. No component depends on one behind it, so that a past behind the present leaves
-    the present as it is. It costs about :math:`S^3 + E S^2`, in double precision.
+    ensemble cannot hold the mixture. No component depends on one behind it, so that a lag window behind the present
+    leaves the present as it is. It costs about :math:`S^3 + E S^2`, in double precision.
 
     Args:
         share: q, of the first, ``[*B, 1]``; with 1 the first comes out, with 0 the second, to rounding.

@@ -1,4 +1,4 @@
-"""Rejection of readings that cannot be true, in front of a filter: not a number, infinite, or too large."""
+"""Rejects invalid readings before a filter: NaN, infinite, or too large."""
 
 from __future__ import annotations
 
@@ -29,46 +29,45 @@ _WRITTEN = WeakIdKeyDictionary()
 
 
 class RejectReadings(Checked, Transform):
-    """Sets the mask of each reading that cannot be true to ``False``, or raises.
+    """Sets the mask of each invalid reading to ``False``, or raises.
 
-    A reading is bad where it is NaN, infinite, or larger than ``limit``; and where its noise is not finite, negative,
-    or no covariance. The bad numbers become zero, so that no network, and no gradient, meets a NaN. The filter behind
-    it treats the reading as a missing observation.
+    A reading is invalid if it is NaN, infinite, or larger than ``limit``; or if its noise is not finite, negative, or
+    no covariance. Invalid values become zero, so that networks and gradients have no NaN. The filter treats the reading
+    as a missing observation.
 
-    It is a TensorDict module: call it on one step ``[*B]`` or on a sequence ``[*B, T]``, put it in front of a filter in
-    a ``TensorDictSequential``, or into a policy. It is a transform, too: append it to an environment in front of
-    :class:`~torch_denkf.transforms.DEnKFTransform`, or to a replay buffer. Like each TensorDict module it sets entries
-    of the tensordict that it is given, and leaves the tensors alone: ``reject(td.copy())`` keeps the NaN in ``td``.
+    It is a TensorDict module: call it on one step ``[*B]`` or on a sequence ``[*B, T]``, put it before a filter in a
+    ``TensorDictSequential``, or into a policy. It is also a transform: append it to an environment before
+    :class:`~torch_denkf.transforms.DEnKFTransform`, or to a replay buffer. Like other TensorDict modules it sets
+    entries of the given tensordict, and does not change tensors in place: ``reject(td.copy())`` keeps the NaN in
+    ``td``.
 
-    In a loop, call it on the frame before that is merged: ``filter.step(belief.update(reject(frame)))``. A tensordict
-    that goes on from step to step, also that of a policy, keeps the mask of the step before. It is not taken for the
-    mask of a new reading, unless the tensordict was cloned in between or the call is compiled.
+    In a loop, call it on the frame before merging: ``filter.step(belief.update(reject(frame)))``. A tensordict that is
+    kept from step to step, also in a policy, has the mask of the previous step. This is recognised and ignored, unless
+    the tensordict was cloned in between or the call is compiled.
 
     Args:
-        masks: the observed mask of each reading, such as ``{"pixels": "observed", "gps": "gps_observed"}``. A mask that
-            is there is combined with what is rejected; one that is not is written. Readings that share a mask are
-            rejected together. A filter must read each of them (``filter.in_keys`` names them).
-        limit: largest absolute value of a reading, in its unit. Squares of more than 1e18 leave float32. Readings in
-            float16 have the largest number of their dtype as their limit, integers have none.
-        by_component: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose components are rejected one by one; their
-            mask becomes ``[*B, O]``. Other readings are rejected as a whole, and keep the width of their mask,
-            ``[*B, 1]`` where there is none: a sensor network needs all of its input.
-        noises: for a reading the entry with its variances ``[*B, O]`` or its covariance ``[*B, O, O]``. Those of a
-            reading that is rejected for them become one, and the identity.
-        spaces: for a reading the space in which it is a point ``[*B, P]``. Its parts, such as the pose, are rejected as
-            a whole and become the neutral point; plain numbers are rejected one by one. A quaternion of zeros is bad,
-            too. The mask ``[*B, D]`` is of the
-            components of a tangent, and so is the noise.
-        on_bad: ``"mask"`` to reject bad readings, ``"raise"`` to raise where no mask hides them. To raise, one flag is
-            read back from the device in each call; under ``torch.compile`` and ``torch.vmap`` nothing raises.
-        count_key: how many readings were rejected, ``[*B, 1]`` int64: the components that a mask turned from ``True``
-            to ``False``.
+        masks: the observed mask of each reading, such as ``{"pixels": "observed", "gps": "gps_observed"}``. An existing
+            mask is combined with the rejections; a missing one is written. Readings that share a mask are rejected
+            together. A filter must read each of them (``filter.in_keys`` names them).
+        limit: largest absolute value of a reading, in its unit. Squares of values above 1e18 overflow in float32. The
+            limit of float16 readings is the largest number of their dtype, integers have none.
+        by_component: readings ``[*B, O]``, or samples ``[*B, E, O]``, whose components are rejected individually; their
+            mask becomes ``[*B, O]``. Other readings are rejected as a whole, as a sensor network needs all of its
+            input, and keep the width of their mask, by default ``[*B, 1]``.
+        noises: entries with the variances ``[*B, O]`` or the covariance ``[*B, O, O]`` of readings. Invalid ones are
+            replaced by one, or the identity.
+        spaces: spaces of readings that are points ``[*B, P]``. Their parts, such as the pose, are rejected as a whole
+            and become the neutral point; components of vectors are rejected individually. A quaternion of zeros is also
+            invalid. The mask ``[*B, D]`` and the noise are those of tangents.
+        on_bad: ``"mask"`` to reject invalid readings, ``"raise"`` to raise if one is marked as observed. The latter
+            synchronises with the device in each call, and has no effect under ``torch.compile`` and ``torch.vmap``.
+        count_key: number of rejections, ``[*B, 1]`` int64: components whose mask changed from ``True`` to ``False``.
 
     Raises:
-        TypeError: for a key that is none, a space that is none, or ``noises`` that are no dict.
+        TypeError: if a key is no key, a space is no space, or ``noises`` is no dict.
         ValueError: if ``masks`` is empty, another argument names a reading that is not in ``masks``, two entries have
-            one key, or ``on_bad`` is unknown. In a call, if a mask is not boolean or of another shape, or a reading has
-            not the size of its space's points; with ``on_bad="raise"``, if a reading is bad.
+            the same key, or ``on_bad`` is unknown. In a call, if a mask is not boolean or of another shape, or a
+            reading differs in size from its space's points; with ``on_bad="raise"``, if a reading is invalid.
         KeyError: in a call, if a reading or its noise is missing.
 
     Example:
@@ -160,13 +159,13 @@ class RejectReadings(Checked, Transform):
         return tensordict.set(self.count_key, count)
 
     def _hidden(self, mask: NestedKey) -> list[NestedKey]:
-        """Lists the readings that a mask hides."""
+        """Lists the readings that are masked."""
         return [key for key, other in self.hidden_by.items() if other == mask]
 
     def _given(self, mask: NestedKey, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor | None]:
-        """Returns the mask of the readings that are there, and the mask before any of them was rejected.
+        """Returns the mask of the current readings, and the mask before any rejection.
 
-        Both are the latter where the mask was written for readings that have been replaced since.
+        Both are the latter if the mask belongs to readings that have been replaced since.
         """
         observed = tensordict.get(mask, None)
         if observed is None or torch.compiler.is_compiling() or observed not in _WRITTEN:
@@ -177,12 +176,12 @@ class RejectReadings(Checked, Transform):
         return observed if rejected_already else before, before
 
     def _usable(self, key: NestedKey, tensordict: TensorDictBase, written: Entries) -> Tensor:
-        """Tells which components of a reading can be used, ``[*B, 1]``, ``[*B, O]`` or ``[*B, D]``.
+        """Returns the mask of valid components of a reading, ``[*B, 1]``, ``[*B, O]`` or ``[*B, D]``.
 
         Args:
             key: of the reading.
             tensordict: with the reading.
-            written: gets the reading, and its noise, with neutral numbers in the place of bad ones.
+            written: output for the reading and its noise, with neutral numbers instead of invalid ones.
         """
         size, value = tensordict.ndim, entry_of(tensordict, key, "RejectReadings", "Rename it in the constructor.")
         good, neutral = self._within(value), value.new_zeros(())
@@ -209,13 +208,13 @@ class RejectReadings(Checked, Transform):
         return known
 
     def _within(self, value: Tensor) -> Tensor:
-        """Tells which numbers are finite and at most ``limit``."""
+        """Masks values that are finite and at most ``limit``."""
         if not value.is_floating_point():
             return torch.ones_like(value, dtype=torch.bool)
         return value.abs() <= min(self.limit, torch.finfo(value.dtype).max)  # also false for NaN
 
     def _judged_noise(self, noise: Tensor, size: int) -> tuple[Tensor, Tensor]:
-        """Tells which variances ``[*B, O]`` are some, and returns them with ones in the place of others."""
+        """Masks valid variances ``[*B, O]``, and returns them with ones in place of invalid ones."""
         good = self._within(noise)
         if noise.ndim < size + 2:
             good = good & (noise >= 0)
@@ -231,7 +230,7 @@ class RejectReadings(Checked, Transform):
         usable: Mapping[NestedKey, Tensor],
         observed: Mapping[NestedKey, Tensor],
     ) -> Iterator[str]:
-        """Names the first bad number of each reading, and of its noise, that no mask hides."""
+        """Names the first invalid value of each reading, and of its noise, that the observed mask does not exclude."""
         for key, fine in usable.items():
             mask, noise = self.hidden_by[key], self.noises.get(key)
             lost = observed[mask] & ~fine
@@ -272,12 +271,12 @@ class RejectReadings(Checked, Transform):
 
 
 def _fits(given: Sequence[int], due: Sequence[int]) -> bool:
-    """Tells whether masks of two widths can be combined."""
+    """Returns True if masks of two widths can be combined."""
     return len(given) == 1 and (given[0] == 1 or due[0] in (1, given[0]))
 
 
 def _whole_parts(space: Space, points: Tensor, tangents: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Widens what is known of points ``[*, P]``, and of their noise ``[*, D]``, to whole parts of the space."""
+    """Widens the mask of points ``[*, P]``, and of their noise ``[*, D]``, to whole parts of the space."""
     parts: list[tuple[Tensor, Tensor]] = []
     for place in places_of(space):
         point, tangent = points[..., place.point], None if tangents is None else tangents[..., place.tangent]

@@ -1,13 +1,12 @@
-r"""A sensor that says whether it sees, and updates that heed it.
+r"""Visibility estimates of a sensor, and updates that use them.
 
-A camera that looks at a pillar still reads something. :class:`Visibility` is a head next to a sensor: it writes the
-probability p that this reading is about the state at all. :class:`Visible` goes around an analysis: the density of a
-reading is
+An occluded camera still gives a reading. :class:`Visibility` is a head of a sensor with the probability p that the
+reading is about the state. :class:`Visible` wraps an analysis; its density of a reading is
 
 .. math:: p\, N(y; h(x), S) + (1 - p)\, b(y)
 
 with b broad, and the belief has the mean and the covariance of the mixture of update and forecast. Both are
-differentiable, so that p is learned from labels, or from the likelihood of the readings alone.
+differentiable, so that p is learned from labels, or from the likelihood of the readings.
 
 Source: the probabilistic data association filter, with one reading and one target (Bar-Shalom & Tse 1975, Automatica
 11); mixtures with a broad component against outliers: Box & Tiao 1968, Biometrika 55.
@@ -37,17 +36,17 @@ __all__ = ["Visibility", "Visible"]
 
 
 class Visibility(Sensor):
-    r"""The probability that a reading is about the state at all, from what the sensor encodes.
+    r"""Predicts the probability that a reading is about the state from the sensor's encoding.
 
-    Labels teach it where there are some: the term ``visible`` of the losses, a binary cross entropy. Where there are
-    none, the likelihood of the readings does, ``nll``, and so does each score of the belief.
+    With labels, it is trained by the term ``visible`` of the losses, a binary cross entropy. Without, it is trained by
+    the likelihood of the readings, ``nll``, or another score of the belief.
 
     Args:
         encoding_dim: F, size of the encoding.
         num_cells: hidden layers.
         start: p before training, the same for all encodings.
-        floor: p stays between ``floor`` and ``1 - floor``: no reading is ever certain, nor lost for good. A filter that
-            is wrong and sure of it finds back the sooner, the surer a head may be.
+        floor: p stays between ``floor`` and ``1 - floor``: no reading is certainly visible or hidden. With a smaller
+            floor, an overconfident filter recovers sooner.
         encoding_key: an entry ``[*B, F]``, or of members ``[*B, E, F]``, whose mean is used.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may be
             NaN.
@@ -94,15 +93,15 @@ class Visibility(Sensor):
         return self.floor + (1 - 2 * self.floor) * self.module(encoding).sigmoid()
 
     def heeded_by(self, analysis: TensorDictModuleBase) -> Visible:
-        """Returns :class:`Visible` around an analysis: readings count as far as this head says."""
+        """Returns :class:`Visible` around an analysis: readings are weighted by this head."""
         return Visible(cast(Update, analysis), visible_key=self.out_keys[0])
 
 
 class Visible(MixedUpdate):
-    r"""Lets a reading count as far as it is about the state.
+    r"""Weights a reading by the probability that it is about the state.
 
-    The analysis runs once. With q, the probability that the reading was about the state now that it is known, the
-    belief is that of the mixture, of q times what the analysis makes of the reading and 1 - q times the forecast:
+    The analysis runs once. With the posterior probability q that the reading is about the state, the belief is the
+    mixture of the updated belief, weighted by q, and the forecast, weighted by 1 - q:
 
     =====================  =============================================================================================
     belief                 what becomes of it
@@ -110,21 +109,21 @@ class Visible(MixedUpdate):
     mean and covariance    the mixture's, q (1 - q) d dᵀ of the way d between both means included; on a space those of
                            the tangents at the forecast
     ensemble               members with the mixture's mean and sample covariance, see
-                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a past that is corrected, too
+                           :func:`~torch_denkf.imperfect.mixture.mix_members`; a lag window that is corrected, too
     particles              the exact mixture: each particle's likelihood is one
     =====================  =============================================================================================
 
     With p = 1 that is the analysis alone, with p = 0 the forecast. ``(info_prefix, "log_likelihood")`` is that of the
     mixture, and ``(info_prefix, "visible")`` ``[*B, 1]`` is q, 0 where nothing is observed. Innovation and ``nis`` are
-    those of the reading as it came. b is the Gaussian that the reading is expected from, ``broad`` times as wide: it is
-    in the reading's own unit, and grows while nothing is seen. A reading of O components that fits the forecast speaks
-    for itself with up to ``broad`` to the power O: with many components, leave out the readings that p says are hidden.
+    those of the unweighted reading. b is the predictive Gaussian of the reading, ``broad`` times as wide: it is in the
+    reading's unit, and grows without visible readings. A reading of O components that fits the forecast speaks for
+    itself with up to ``broad`` to the power O: with many components, leave out the readings that p says are hidden.
 
     Args:
         analysis: of an ensemble, of a mean and a covariance, or of particles with a Gaussian likelihood. Its keys and
             its noise are kept.
-        broad: factor on the standard deviations of b; above 1. It says how far off a reading is that is about something
-            else: about what it may read, divided by how far off it is where it sees.
+        broad: factor on the standard deviations of b; above 1. About the range of possible readings, divided by the
+            error of visible readings.
         visible_key: p, ``[*B, 1]``, see :class:`Visibility`.
 
     Raises:

@@ -1,7 +1,6 @@
-"""Does the spread of a belief say how wrong its mean is?
+"""Calibration of a belief: spread over skill, coverage of intervals, and probability integral transforms.
 
-Spread over skill, shares of intervals that hold the truth, and what is uniform for a calibrated belief. A truth that is
-NaN is not known, and does not count.
+Components whose truth is NaN are left out.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ def spread_skill_ratio(
     members is then (E+1)/E times their variance, on average.
 
     Args:
-        mean: of the ensemble, ``[*B, S]``.
-        variance: of the ensemble with divisor E-1, ``[*B, S]``.
-        truth: ``[*B, S]``, in the same units; what is NaN does not count.
+        mean: mean of the ensemble, ``[*B, S]``.
+        variance: variance of the ensemble with divisor E-1, ``[*B, S]``.
+        truth: ``[*B, S]``, in the same units; NaN is left out.
         ensemble_size: E; ``None`` for a distribution whose moments are exact.
-        space: whose points ``[*B, P]`` mean and truth are; the variance is one of tangents.
+        space: space of mean and truth, points ``[*B, P]``; the variance is of tangents.
 
     Returns:
-        One ratio a state dimension, ``[S]``.
+        One ratio per state dimension, ``[S]``.
 
     Raises:
         ValueError: if the shapes differ.
@@ -72,18 +71,18 @@ def interval_coverage(
 ) -> Tensor:
     """Returns the share of the truth inside the central interval of a Gaussian, ``mean ± z sqrt(variance)``.
 
-    It is ``level`` for a calibrated belief, less for an overconfident one. Without ``space`` variances of points are of
-    other axes than their differences: :func:`torch_denkf.diagnosis.evaluate` takes the space from a filter.
+    It is ``level`` for a calibrated belief, less for an overconfident one. Points need ``space``, since their variances
+    are along other axes than their differences; :func:`torch_denkf.diagnosis.evaluate` takes it from a filter.
 
     Args:
         mean: ``[*B, S]``.
         variance: ``[*B, S]``.
-        truth: ``[*B, S]``, in the same units; what is NaN does not count.
+        truth: ``[*B, S]``, in the same units; NaN is left out.
         level: probability of the interval.
-        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
+        space: space of mean and truth, points ``[*B, P]``; ``None`` for plain numbers. The variance is of tangents.
 
     Returns:
-        One share a state dimension, ``[S]``; NaN where a belief is.
+        One share per state dimension, ``[S]``; NaN if a belief is NaN.
 
     Raises:
         ValueError: if the shapes differ, if ``level`` is not in (0, 1), or if a variance is negative.
@@ -105,22 +104,22 @@ def ensemble_interval_coverage(
 ) -> Tensor:
     """Returns the share of the truth inside the members' central interval: ``level`` if calibrated, Gaussian or not.
 
-    The truth of a calibrated ensemble is as likely to fall into any of the E+1 gaps between and beyond the sorted
-    members. The interval therefore ends at rank p (E+1), p = (1 - level)/2, between two members where that is no whole
-    number.
+    The truth of a calibrated ensemble is equally likely to fall into each of the E+1 gaps between and beyond the sorted
+    members. So the interval ends at rank p (E+1), p = (1 - level)/2, interpolated between two members if that is not
+    a whole number.
 
     Args:
         ensemble: ``[*B, E, S]``.
-        truth: ``[*B, S]``, in the same units; what is NaN does not count.
-        level: probability of the interval, at most (E-1)/(E+1), which is what all members span.
-        space: whose points members and truth are; ``None`` for plain numbers. Tangents at the members' mean are ranked.
+        truth: ``[*B, S]``, in the same units; NaN is left out.
+        level: probability of the interval, at most (E-1)/(E+1), the probability of the range of all members.
+        space: space of members and truth; ``None`` for plain numbers. Tangents at the members' mean are ranked.
 
     Returns:
-        One share a state dimension, ``[S]``; NaN where a belief is.
+        One share per state dimension, ``[S]``; NaN if a belief is NaN.
 
     Raises:
-        ValueError: if the shapes do not fit, ``level`` is not in (0, 1) or more than the members can tell, or
-            points of another space.
+        ValueError: if the shapes do not fit, if ``level`` is not in (0, 1) or too large for the number of members, or
+            for points of another space.
 
     Reference:
         Hyndman & Fan 1996, "Sample quantiles in statistical packages", Am. Stat. 50, definition 6.
@@ -138,17 +137,17 @@ def ensemble_interval_coverage(
 def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, Tensor]:
     """Returns the members' central interval, which contains the truth with probability ``level`` if calibrated.
 
-    It ends at rank p (E+1) of the sorted members, p = (1 - level)/2, between two members where that is no whole number.
+    It ends at rank p (E+1) of the sorted members, p = (1 - level)/2, interpolated if that is not a whole number.
 
     Args:
-        ensemble: ``[*B, E, S]``. Bring angles that straddle ±π to one side before.
-        level: probability of the interval, at most (E-1)/(E+1), which is what all members span.
+        ensemble: ``[*B, E, S]``. Unwrap angles that straddle ±π first.
+        level: probability of the interval, at most (E-1)/(E+1), the probability of the range of all members.
 
     Returns:
         The lower and the upper end, both ``[*B, S]``, in the members' units.
 
     Raises:
-        ValueError: if ``level`` is not in (0, 1) or more than the members can tell.
+        ValueError: if ``level`` is not in (0, 1) or too large for the number of members.
 
     Example:
         >>> low, high = ensemble_interval(torch.arange(19.0).unsqueeze(-1), level=0.8)
@@ -175,18 +174,18 @@ def ensemble_interval(ensemble: Tensor, *, level: float = 0.9) -> tuple[Tensor, 
 def pit(mean: Tensor, variance: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
     r"""Returns the probability integral transform of the truth, :math:`\Phi((x - \bar x) / \sqrt{s^2})`.
 
-    It is uniform in [0, 1] for a calibrated Gaussian belief. An overconfident one gathers it at both ends, a timid one
-    in the middle, and a biased one at one end.
+    It is uniform in [0, 1] for a calibrated Gaussian belief. An overconfident belief concentrates it at both ends, an
+    underconfident one in the middle, and a biased one at one end.
 
     Args:
         mean: ``[*B, S]``.
         variance: ``[*B, S]``.
         truth: ``[*B, S]``, in the same units.
-        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
+        space: space of mean and truth, points ``[*B, P]``; ``None`` for plain numbers. The variance is of tangents.
 
     Returns:
-        ``[*B, S]`` in [0, 1]. Where the variance is zero: 0 or 1, and 0.5 for a truth that equals the mean. NaN where
-        the truth is.
+        ``[*B, S]`` in [0, 1]. For a variance of zero: 0 or 1, and 0.5 for a truth that equals the mean. NaN where the
+        truth is NaN.
 
     Raises:
         ValueError: if the shapes differ, or if a variance is negative.
@@ -209,7 +208,7 @@ def around_mean(
 ) -> tuple[Tensor, Tensor]:
     """Returns members and truth relative to the members' mean: ``[*B, E, S]`` and ``[*B, S]``.
 
-    Of points of a space they are tangents: members and truth that are drawn alike are so in these axes, too.
+    On a space they are tangents: if members and truth have the same distribution, so have their tangents.
     """
     if ensemble.ndim != truth.ndim + 1 or (*ensemble.shape[:-2], ensemble.shape[-1]) != truth.shape:
         raise ValueError(
@@ -226,7 +225,7 @@ def around_mean(
 
 
 def check_variance(variance: Tensor, error: Tensor) -> None:
-    """Raises unless variances are those of an error: of its shape, and not negative.
+    """Raises unless variances have the shape of the error, and are not negative.
 
     Raises:
         ValueError: if they are not.
@@ -241,6 +240,6 @@ def check_variance(variance: Tensor, error: Tensor) -> None:
 
 
 def _share(margin: Tensor, truth: Tensor) -> Tensor:
-    """Returns the share of margins ``[*B, S]`` that are not negative; NaN where one is NaN."""
+    """Returns the share of margins ``[*B, S]`` that are not negative; NaN if one is NaN."""
     inside = (margin >= 0).to(torch.get_default_dtype())
     return mean_of_known(inside.where(~margin.isnan(), torch.nan), truth)

@@ -1,4 +1,4 @@
-"""Does the error of a Gaussian belief fit its covariance? Likelihood of the truth, and the NEES with its bounds."""
+"""Consistency of a Gaussian belief: the normalised estimation error squared (NEES) and its bounds."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ __all__ = ["NEES", "nees"]
 
 
 class NEES(NamedTuple):
-    """Holds the results of :func:`nees`; ``*M`` are the batch dims that are left after averaging.
+    """Holds the results of :func:`nees`; ``*M`` are the batch dims that remain after averaging.
 
     Attributes:
-        mean: ``[*M]``; S for a consistent filter.
-        lower: below it the filter is underconfident: its covariance is larger than its errors.
-        upper: above it the filter is overconfident: its covariance is smaller than its errors.
-        values: of each state, ``[*B]``.
+        mean: mean NEES, ``[*M]``; S for a consistent filter.
+        lower: bound below which the filter is underconfident: its covariance is larger than its errors.
+        upper: bound above which the filter is overconfident: its covariance is smaller than its errors.
+        values: NEES of each state, ``[*B]``.
     """
 
     mean: Tensor
@@ -38,7 +38,7 @@ def nees(
     level: float = 0.95,
     dim: int | None = None,
 ) -> NEES:
-    r"""Returns the normalised estimation error squared :math:`e^\top P^{-1} e`, its mean, and where that should lie.
+    r"""Returns the normalised estimation error squared :math:`e^\top P^{-1} e`, its mean, and bounds of the mean.
 
     The sum over N independent errors that fit their covariance is chi-square distributed with N S degrees of freedom,
     so that the mean lies between ``lower`` and ``upper`` with probability ``level``. The errors of one run at
@@ -50,10 +50,10 @@ def nees(
 
     Args:
         mean: ``[*B, S]``.
-        covariance: P, ``[*B, S, S]``, or the variances ``[*B, S]`` where the errors are uncorrelated.
+        covariance: P, ``[*B, S, S]``, or the variances ``[*B, S]`` if the errors are uncorrelated.
         truth: ``[*B, S]``, in the same units.
-        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The covariance is then one of
-            tangents at the mean, S their number.
+        space: the space of mean and truth, points ``[*B, P]``; the covariance is then of the S-dimensional tangents at
+            the mean. ``None`` for vectors.
         level: probability of the bounds.
         dim: batch dimension to average over; all of them by default.
 
@@ -61,8 +61,8 @@ def nees(
         A :class:`NEES`.
 
     Raises:
-        ValueError: if the shapes do not fit, if a covariance is not positive definite (that of fewer than S + 1 members
-            never is), if ``level`` is not in (0, 1), if the truth is NaN, or if there is nothing to average over.
+        ValueError: if the shapes do not fit, if a covariance is not positive definite (the covariance of fewer than
+            S + 1 members never is), if ``level`` is not in (0, 1), if the truth is NaN, or if there are no errors.
 
     Source:
         Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", section 5.4.2.
@@ -76,7 +76,7 @@ def nees(
     """
     check_level(level)
     if bool(truth.isnan().any()):
-        raise ValueError("the truth is NaN in places, where it is not known; leave out the rows that are not whole")
+        raise ValueError("the truth is NaN, unknown, in some places; leave out these rows")
     error = state_difference(mean, truth, space=space)
     scale = _scale(error, covariance)
     if covariance.ndim == error.ndim:

@@ -1,12 +1,12 @@
-"""Errors of an estimated state, one figure for each of its dimensions.
+"""Errors of an estimated state, one number for each of its dimensions.
 
-A truth that is NaN is not known: it counts nowhere. Of data with a mask of labels that is
+A truth that is NaN is unknown, and left out. For data with a mask of labels, pass
 ``truth.where(data["state_observed"], torch.nan)``.
 
-States may be points of a space, such as ``Product(SO3(), Euclidean(3))``: pass ``space=``, of numbers of
-which some are angles :class:`~torch_denkf.functional.manifolds.Flat`.
-Errors, variances and covariances are then those of tangents, ``[*B, D]``, and each figure is one of a component of
-tangents. A part of the space whose truth is NaN in places is not known.
+States may be points of a space, such as ``Product(SO3(), Euclidean(3))``: pass ``space=``. For vectors in which some
+components are angles, this is :class:`~torch_denkf.functional.manifolds.Flat`.
+Errors, variances and covariances are then of tangents, ``[*B, D]``, one number for each component of
+tangents. If one component of a rotation or pose has an unknown truth, all of it is unknown.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ class StateErrors(NamedTuple):
 def state_difference(estimated: Tensor, truth: Tensor, *, space: Space | None = None) -> Tensor:
     """Subtracts the truth from the estimate; headings that differ by whole turns are the same.
 
-    From the truth to the estimate and back leads a tangent and its negative: it is the error at either.
+    On a space the error is the tangent from the truth to the estimate; the tangent back is its negative.
 
     Args:
         estimated: states, ``[*B, S]``.
         truth: the true states, of the same shape.
-        space: whose points the states are, such as ``Flat(5, circular=[2])`` of (x, y, θ, v, θ_dot); ``None``
-            for plain numbers. Turn rates are no angles.
+        space: space of the states, such as ``Flat(5, circular=[2])`` for (x, y, θ, v, θ_dot); ``None``
+            for plain numbers. Turn rates are not angles.
 
     Returns:
-        The differences, ``[*B, S]``; angles in [-π, π). Of points of a space the tangents, ``[*B, D]``.
+        The differences, ``[*B, S]``; angles in [-π, π). For points of a space the tangents, ``[*B, D]``.
 
     Raises:
         ValueError: if the shapes differ, or for points of another space.
@@ -69,17 +69,17 @@ def state_difference(estimated: Tensor, truth: Tensor, *, space: Space | None = 
 def state_errors(estimated: Tensor, truth: Tensor, *, space: Space | None = None) -> StateErrors:
     """Returns root mean square and mean absolute error of each dimension, over all batch dims.
 
-    Dimensions are kept apart: a mean over metres, radians and metres per second, as the reference script of the DEnKF
-    paper prints it, is ruled by whichever unit has the largest numbers.
+    Dimensions are separate: a mean over metres, radians and metres per second, as in the reference script of the
+    DEnKF paper, is dominated by the unit with the largest numbers.
 
     Args:
         estimated: states, ``[*B, S]``, such as the mean of a belief.
-        truth: the true states, of the same shape; NaN where they are not known, which does not count.
-        space: whose points the states are, see :func:`state_difference`; ``None`` for plain numbers. See
+        truth: the true states, of the same shape; NaN where unknown, which is left out.
+        space: space of the states, see :func:`state_difference`; ``None`` for plain numbers. See
             :func:`rotation_error` for angles between orientations.
 
     Returns:
-        A :class:`StateErrors`; NaN in a dimension whose truth is nowhere known.
+        A :class:`StateErrors`; NaN in a dimension whose truth is never known.
 
     Raises:
         ValueError: if the shapes differ, there are no states, or for points of another space.
@@ -102,15 +102,15 @@ def state_errors(estimated: Tensor, truth: Tensor, *, space: Space | None = None
 def rotation_error(estimated: Tensor, truth: Tensor, *, space: Space) -> Tensor:
     """Returns the angle between an estimated and a true orientation, in degrees.
 
-    It is the length of the shortest turn from one to the other, the geodesic distance.
+    It is the geodesic distance, the angle of the shortest rotation from one to the other.
 
     Args:
         estimated: points of the space, ``[*B, P]``.
-        truth: the true points, of the same shape; NaN where they are not known.
-        space: one with K orientations: ``Circle``, ``SO3``, ``SE2``, ``SE3``, ``SE23``, or a product with some.
+        truth: the true points, of the same shape; NaN where unknown.
+        space: space with K orientations: ``Circle``, ``SO3``, ``SE2``, ``SE3``, ``SE23``, or a product with some.
 
     Returns:
-        ``[*B, K]``, in [0, 180]; NaN where the truth is.
+        ``[*B, K]``, in [0, 180]; NaN where the truth is NaN.
 
     Raises:
         ValueError: if the shapes do not fit, or if the space has no orientation.
@@ -130,13 +130,13 @@ def rotation_error(estimated: Tensor, truth: Tensor, *, space: Space) -> Tensor:
 
 
 def check_level(level: float) -> None:
-    """Raises a ``ValueError`` unless a level is a probability of an interval, in (0, 1)."""
+    """Raises a ``ValueError`` unless ``level`` is the probability of an interval, in (0, 1)."""
     if not 0.0 < level < 1.0:
         raise ValueError(f"level is the probability of the interval, in (0, 1); got {level}.")
 
 
 def known_tangents(truth: Tensor, space: Space | None) -> Tensor:
-    """Marks unknown errors by NaN: the truth ``[*B, S]``, of points of a space zeros and NaN, ``[*B, D]``."""
+    """Marks unknown errors by NaN: returns the truth ``[*B, S]``, or for points zeros and NaN, ``[*B, D]``."""
     if space is None:
         return truth
     known = whole_parts(space, ~truth.isnan())[1]
@@ -144,7 +144,7 @@ def known_tangents(truth: Tensor, space: Space | None) -> Tensor:
 
 
 def mean_of_known(values: Tensor, truth: Tensor) -> Tensor:
-    """Returns the mean of values ``[*B, S]`` over all batch dims, where the truth ``[*B, S]`` is not NaN, ``[S]``.
+    """Returns the mean of values ``[*B, S]`` over all batch dims where the truth ``[*B, S]`` is not NaN, ``[S]``.
 
     Examples:
         >>> mean_of_known(torch.tensor([[1.0], [3.0], [9.0]]), torch.tensor([[0.0], [0.0], [torch.nan]]))

@@ -1,4 +1,4 @@
-"""Runs an image trunk within a memory budget: frames in chunks, activations computed twice, half the bits."""
+"""Runs an image trunk within a memory budget: by chunks of frames, recomputed activations, and reduced precision."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class _Allocations(TorchDispatchMode):
 
 
 def activation_bytes(trunk: nn.Module, frame: Tensor) -> int:
-    """Returns the bytes of all that ``trunk`` computes on its way from ``frame``, ``[1, *event]``.
+    """Returns the bytes of all tensors that ``trunk`` computes for ``frame``, ``[1, *event]``.
 
     Example:
         >>> activation_bytes(nn.Sequential(nn.Flatten(), nn.ReLU()), torch.zeros(1, 2, 3, dtype=torch.float32))
@@ -57,7 +57,7 @@ def activation_bytes(trunk: nn.Module, frame: Tensor) -> int:
 
 
 def couples_frames(trunk: nn.Module) -> bool:
-    """Returns whether a batch norm makes a frame's features depend on what else is in its chunk."""
+    """Tells whether a batch norm makes a frame's features depend on other frames in its chunk."""
     return any(isinstance(module, _BATCH_NORMS) for module in trunk.modules())
 
 
@@ -69,14 +69,14 @@ def reduced_precision(dtype: torch.dtype | None, device: torch.device) -> Abstra
 def in_chunks(
     encode: Callable[..., Tensor], frames: Tensor, seen: Tensor | None, *, at_once: int | None, recompute: bool
 ) -> Tensor:
-    """Encodes frames some at a time.
+    """Encodes frames in chunks.
 
     Args:
-        encode: from frames ``[M, *event]`` and their mask ``[M, ...]`` (or ``None``) to features ``[M, F]``.
+        encode: maps frames ``[M, *event]`` and their mask ``[M, ...]`` (or ``None``) to features ``[M, F]``.
         frames: ``[N, *event]``.
         seen: mask ``[N, ...]`` or ``None``.
         at_once: the largest M; ``None`` for all.
-        recompute: whether to keep a chunk's input alone for the backward pass, and to compute the rest again there
+        recompute: whether to store only a chunk's input for the backward pass, and to recompute the rest there
             (activation checkpointing).
 
     Returns:

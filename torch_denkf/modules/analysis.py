@@ -26,34 +26,34 @@ class EnsembleAnalysis(EnsembleUpdate):
     Args:
         scheme: ``"sensor"`` (the paper: innovations from the sensor's samples), ``"perturbed"`` (the sensor's mean
             plus N(0, R)), ``"etkf"`` (symmetric square root) or ``"sakov"`` (Sakov & Oke's deterministic update).
-        inflation: factor on the analysis anomalies, where anything is observed; 1 for none.
-        inflated: components of the state that the inflation multiplies; ``None`` for all. Where nothing observes a
-            component, or where it is the past, which is not forecast again, factors pile up in it.
+        inflation: factor of the analysis anomalies where anything is observed; 1 for none.
+        inflated: components of the state to inflate; ``None`` for all. Exclude components that no reading observes,
+            and the lag window, which is not forecast again: inflation would accumulate in them.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
         rotate: random mean-preserving rotation of the anomalies (``"etkf"`` only).
-        taper: localisation: factors on the covariances of state and observation ``[S, O]`` and of the observations
-            ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Where one observation can say
-            nothing about a component of the state but what E members happen to show, the factor is 0.
-        localisation: ``"significance"`` uses a covariance of state and observation as far as E members can tell it
-            from chance, see :func:`~torch_denkf.functional.analysis.significant`. It keeps members honest that are too
-            few for exact draws, where fast sensors make thousands of updates. ``None`` uses all.
-        threshold: of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is trained. The
-            more updates a component sees between two readings about it, the larger. One that is trained beyond
-            sqrt(E - 1) ignores all, and has no gradient that would bring it back.
-        space: in which the state lives, such as ``Product(SO3(), Euclidean(3))``: members are points, the update is
-            made with the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's. See
+        taper: localisation: factors of the covariances of state and observation ``[S, O]`` and of the observations
+            ``[O, O]``, see :func:`~torch_denkf.functional.analyse`; ``None`` for none. Use a factor of 0 for an
+            observation without information about a component, so that chance correlations of E members are ignored.
+        localisation: ``"significance"`` uses covariances of state and observation according to their significance,
+            see :func:`~torch_denkf.functional.analysis.significant`. It prevents overconfidence of ensembles that are
+            too small for exact draws, if fast sensors make thousands of updates. ``None`` uses all covariances.
+        threshold: threshold of ``"significance"``, in standard deviations: one number or ``[S]``; a ``Parameter`` is
+            trained. Choose it larger if many updates come between two readings of a component. A threshold trained
+            beyond sqrt(E - 1) ignores all readings, and gets no gradient any more.
+        space: space of the state, such as ``Product(SO3(), Euclidean(3))``: members are points, the update uses
+            the tangents at the forecast's mean, and ``var`` is of the tangents at the belief's mean. See
             :mod:`torch_denkf.functional.manifolds`.
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
+        reading_space: space of the reading, such as ``Circle()`` for an angle; innovation and R are tangents.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
-        draws: of ``"perturbed"``, ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
-        **options: those above that every update of an ensemble has, see
-            :class:`~torch_denkf.modules.ensemble.EnsembleOptions`, and the keys,
-            :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs learned
-            observations, not one reading.
+        draws: draws of ``"perturbed"``, ``"exact"`` or ``"random"``, see
+            :func:`~torch_denkf.functional.draws.exact_draws`.
+        **options: common options of ensemble updates, see :class:`~torch_denkf.modules.ensemble.EnsembleOptions`, and
+            the keys, :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. The scheme ``"sensor"`` needs
+            learned observations, not one reading.
 
     Raises:
         ValueError: on an unknown scheme, an ``inflation`` that is not positive, a ``relaxation`` outside [0, 1], a
-            ``taper`` with ``"etkf"``, and factors of it that are not finite or ask for a gradient.
+            ``taper`` with ``"etkf"``, and a ``taper`` that is not finite or requires a gradient.
         KeyError: if an entry is missing.
 
     Example:
@@ -99,7 +99,7 @@ class EnsembleAnalysis(EnsembleUpdate):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Returns perturbations or rotations, where the scheme needs any."""
+        """Names the perturbations or rotations, if the scheme needs any."""
         return ("",) if self.rotate or self.scheme == "perturbed" else ()
 
     def draw_noise(self, batch_size, *, members=None, observation_dim=None, generator=None, **where):
@@ -116,15 +116,15 @@ class EnsembleAnalysis(EnsembleUpdate):
         noise = super()._noise(entries, values, call)
         if self.scheme != "perturbed" or not self.exact or not isinstance(noise, torch.Tensor):
             return noise
-        if noise.shape[-1] >= noise.shape[-2]:  # the mean alone could be exact, and analyse() takes it out
+        if noise.shape[-1] >= noise.shape[-2]:  # only the mean could be exact, and analyse() removes it
             return noise
         forecast, predicted = values[:2]
         observed = entries.get(self.observed_key)
-        if observed is not None:  # hidden predictions may be NaN
+        if observed is not None:  # masked predictions may be NaN
             predicted = torch.where(observed.unsqueeze(-2) | predicted.isfinite(), predicted, 0)
         if self.space is not None:
             forecast = self.space.minus(forecast, self.space.near(forecast).unsqueeze(-2))
-        size = noise.shape[-2]  # analyse() makes up for the mean that it takes out of a sample
+        size = noise.shape[-2]  # analyse() rescales after it removes the mean
         return exact_draws(noise, predicted, forecast) * ((size - 1) / size) ** 0.5
 
     def noise_sizes(self, forecast, predicted, *_):
@@ -133,7 +133,7 @@ class EnsembleAnalysis(EnsembleUpdate):
         return {**super().noise_sizes(forecast), "observation_dim": size}
 
     def reading_dims(self, entries, call):
-        """Returns how many numbers the reading has; of samples, ``(E, O)``."""
+        """Returns the sizes of the reading and its noise; of samples, ``(E, O)``."""
         (dim, *others), forecast = super().reading_dims(entries, call), entries.get(self.in_keys[0])
         return [dim if self.scheme != "sensor" or forecast is None else (forecast.shape[-2], dim), *others]
 
@@ -150,7 +150,7 @@ class EnsembleAnalysis(EnsembleUpdate):
             ensemble = relax_to_prior_spread(ensemble, forecast, self.relaxation)
         if self.inflation != 1.0:
             inflated = inflate(ensemble, self._factor(ensemble))
-            if observed is not None:  # without an analysis there is nothing to make up for, and factors would pile up
+            if observed is not None:  # without an analysis inflation would only accumulate
                 inflated = torch.where(self._any(observed)[..., None, None], inflated, ensemble)
             ensemble = inflated
         mean, away = ensemble_mean(ensemble), ensemble
@@ -172,13 +172,13 @@ class EnsembleAnalysis(EnsembleUpdate):
         return factor
 
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
-        """Overrides :meth:`Update.move_past`; neither inflation nor relaxation touches the past."""
+        """Overrides :meth:`Update.move_past`; the lag window is neither inflated nor relaxed."""
         center = None
         if self.space is not None:
             center = self.space.near(past.movedim(-3, -2)).unsqueeze(-3)  # of each time
             past = self.space.minus(past, center)
         lag, dim = past.shape[-2:]
-        # Where the analysis sees more than the state, such as velocities of past steps, the state comes first.
+        # The analysis may also have past states, such as velocities; the state's components come first.
         taper = None if self.state_taper is None else self.state_taper[:dim].repeat(lag, 1)
         options = self._options(noise, taper)
         threshold = self.significance

@@ -1,4 +1,4 @@
-"""Wrappers: modules around another one in its role, and an initial belief with further entries."""
+"""Wrappers around a module in its role, and an initial belief with further entries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ W = TypeVar("W", bound="Wrapper")
 
 
 class _Inside:
-    """An attribute or method of a wrapper: that of the module inside, unless the wrapper has or sets its own."""
+    """Descriptor of a wrapper that forwards to the module inside, unless the wrapper defines the name itself."""
 
     def __init__(self, kind: type[SubModel], name: str):
         self.kind, self.name = kind, name
@@ -29,21 +29,21 @@ class _Inside:
 
 
 class Wrapper(SubModel):
-    """Goes around another module and takes its place: keys, noise and the noise's name are those of the module inside.
+    """Wraps another module and replaces it: keys, noise and its name are those of the module inside.
 
     A sub-class overrides what it changes, mostly :meth:`on_entries`. :class:`Around` and :class:`AroundInitial` also
-    pass on what the module inside declares in its role, such as the ``reading_keys`` of an update.
+    forward the declarations of the module inside in its role, such as the ``reading_keys`` of an update.
 
     Args:
         module: any TensorDict module.
-        in_keys: of the wrapper; those of the module by default.
-        out_keys: likewise.
-        optional_keys: likewise.
-        further_keys: what the wrapper reads besides ``in_keys``.
+        in_keys: inputs of the wrapper; those of the module by default.
+        out_keys: outputs of the wrapper; those of the module by default.
+        optional_keys: optional inputs of the wrapper; those of the module by default.
+        further_keys: inputs of the wrapper in addition to ``in_keys``.
 
     Attributes:
-        place: name of the module inside, where its noise has a place inside of the wrapper's, ``("noise",
-            "transition.transition")``; ``None`` where it has the wrapper's.
+        place: name of the module inside, if its noise is nested in the wrapper's, ``("noise",
+            "transition.transition")``; ``None`` if its noise has the wrapper's place.
     """
 
     place: str | None = None
@@ -67,11 +67,11 @@ class Wrapper(SubModel):
         )
 
     def parts(self):
-        """Returns the module inside, under the empty name where its noise has the wrapper's place."""
+        """Returns the module inside, under the empty name if its noise has the wrapper's place."""
         return {self.place or "": self.module}
 
     def run_inside(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the module inside writes."""
+        """Runs the module inside and returns its outputs."""
         return run_module(self.module, entries, call if self.place is None else call.part(self.place))
 
     def on_entries(self, entries, call):
@@ -80,7 +80,7 @@ class Wrapper(SubModel):
 
 
 def passes_on(kind: type[SubModel]) -> Callable[[type[W]], type[W]]:
-    """Lets a class of wrappers pass on all that a role declares, but for what the class defines itself."""
+    """Makes a class of wrappers forward the declarations of a role that the class does not define itself."""
 
     def passing(wrapper: type[W]) -> type[W]:
         for name in vars(kind):
@@ -93,15 +93,16 @@ def passes_on(kind: type[SubModel]) -> Callable[[type[W]], type[W]]:
 
 @passes_on(Update)
 class Around(Wrapper, Update):
-    """Goes around an update, and passes on all that the update declares: a wrapper overrides what it changes.
+    """Wraps an update, and forwards its declarations; a sub-class overrides some of them.
 
-    What corrects a past, such as the lag of :class:`~torch_denkf.smoothers.FixedLag`, goes inside, see :meth:`around`.
+    A wrapper that corrects a lag window, such as that of :class:`~torch_denkf.smoothers.FixedLag`, is put inside this
+    one, see :meth:`around`.
 
     Args:
         module: the update inside.
-        in_keys: of the wrapper; those of the update by default.
-        out_keys: likewise.
-        optional_keys: likewise.
+        in_keys: inputs of the wrapper; those of the update by default.
+        out_keys: outputs of the wrapper; those of the update by default.
+        optional_keys: optional inputs of the wrapper; those of the update by default.
 
     Example:
         >>> from tensordict import TensorDict
@@ -127,14 +128,14 @@ class Around(Wrapper, Update):
         tensor([1.])
     """
 
-    updates_ensemble = False  # a past around the wrapper would miss what the wrapper changes
+    updates_ensemble = False  # a lag window around the wrapper would bypass its changes
     aligned, on_aligned = Update.aligned, Update.on_aligned
 
     def around(self, update: Update) -> Self:
         """Returns the same wrapper around another update of the same reading, parameters shared.
 
         Args:
-            update: e.g. a :class:`~torch_denkf.smoothers.past.LaggedAnalysis` of the one inside.
+            update: e.g. a :class:`~torch_denkf.smoothers.past.LaggedAnalysis` of the update inside.
         """
         other = copy.copy(self)
         for name in ("_parameters", "_buffers", "_modules"):
@@ -148,20 +149,20 @@ class Around(Wrapper, Update):
 
 @passes_on(Initial)
 class AroundInitial(Wrapper, Initial):
-    """Goes around an initial belief, and passes on all that it declares."""
+    """Wraps an initial belief, and forwards its declarations."""
 
 
 class AugmentedBelief(AroundInitial):
-    """An initial belief, and further entries that begin with the episode.
+    """Adds further entries to an initial belief, which are reset with the episode.
 
     Args:
         initial: the initial belief.
         keys: the further entries.
-        begin: their values, in that order, from the belief (its tensors by key) and its batch size. So that the filter
-            can be pickled, it is a function of a module, its options in a :class:`functools.partial`.
-        follow_keys: entries of the belief that follow from those that are carried on.
-        follow: their values, in that order, from the entries that are carried on, or from those that ``begin`` gives.
-        nested: whether the noise of ``initial`` has its place inside of this one's: ``("noise", "initial.initial")``.
+        begin: returns their values, in that order, from the belief (its tensors by key) and its batch size. For
+            pickling, use a function of a module, with options in a :class:`functools.partial`.
+        follow_keys: entries of the belief that are computed from the carried ones.
+        follow: returns their values, in that order, from the carried entries, or from those of ``begin``.
+        nested: whether the noise of ``initial`` is nested in this module's: ``("noise", "initial.initial")``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -196,7 +197,7 @@ class AugmentedBelief(AroundInitial):
         return {**written, **self._following(written)}
 
     def derived(self, carried):
-        """Returns what follows for the module inside, and here."""
+        """Returns the derived entries of the module inside and of this module."""
         return {**role(self.module, Initial).derived(carried), **self._following(carried)}
 
     def _following(self, entries: Entries) -> Entries:

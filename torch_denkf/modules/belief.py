@@ -77,7 +77,7 @@ class GaussianPrior(_InitialEnsemble):
         mean: ``[S]``, in the state's units.
         std: standard deviations ``[S]``.
         ensemble_size: E.
-        space: in which the state lives; ``None`` for plain numbers. ``mean`` is a point, ``std`` is of the tangents.
+        space: space of the state; ``None`` for plain numbers. ``mean`` is a point, ``std`` is of the tangents.
         draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
@@ -119,7 +119,7 @@ class AroundState(_InitialEnsemble):
         std: standard deviations ``[S]``, in the state's units.
         ensemble_size: E.
         state_key: the known state ``[*B, S]``.
-        space: in which the state lives; ``None`` for plain numbers. ``std`` is of the tangents.
+        space: space of the state; ``None`` for plain numbers. ``std`` is of the tangents.
         draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`.
         out_keys: ensemble ``[*B, E, S]``, mean ``[*B, S]``, variance ``[*B, S]``.
 
@@ -155,10 +155,10 @@ class AroundState(_InitialEnsemble):
 class FromSensor(_InitialEnsemble):
     """A belief from the first sensor reading: observed dimensions N(mean reading, R), the others a Gaussian prior.
 
-    Where nothing is observed at reset, the prior alone is used, as with ``filter.initialise(..., without=[...])``.
+    If nothing is observed at reset, only the prior is used, as with ``filter.initialise(..., without=[...])``.
 
     Args:
-        dims: state dimensions that the sensor reads, in the observation's order.
+        dims: state dimensions that the sensor observes, in the observation's order.
         mean: prior mean ``[S]``, in the state's units.
         std: prior standard deviations ``[S]``.
         ensemble_size: E.

@@ -1,4 +1,4 @@
-"""The extended Kalman filter's two steps, through any transition and any observation model of ensembles."""
+"""The extended Kalman filter's two steps, for any transition and any observation model of ensembles."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ __all__ = ["EKFAnalysis", "EKFTransition"]
 class EKFTransition(GaussianTransition):
     r"""Forecast :math:`f(m)` and :math:`F P F^T + Q` with the Jacobian F of the transition at the mean.
 
-    The transition runs on ensembles of one member; its stochastic networks run their deterministic forward. F is what
-    it says itself (``jacobian``), as known motions and networks of linear layers do; of anything else it comes from
-    automatic differentiation. It can be differentiated. Rows of a batch must not depend on each other.
+    The transition runs on ensembles of one member; its stochastic networks run their deterministic forward. Known
+    motions and networks of linear layers compute F themselves (``jacobian``); for other transitions it comes from
+    automatic differentiation. F can be differentiated. Rows of a batch must not depend on each other.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.LearnedTransition`.
         process_noise: writes Q, variances ``[*B, S]`` or a covariance ``[*B, S, S]``, see
             :mod:`torch_denkf.modules.process_noise`; it may read the belief's mean and the forecast's.
-        stop_jacobian_gradient: F is a constant to the gradient (as in Kloss et al. 2021).
+        stop_jacobian_gradient: whether F is a constant to the gradient (as in Kloss et al. 2021).
         **keys: see :class:`GaussianTransitionKeys`.
 
     Raises:
-        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
+        ValueError: if the transition has random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
             draws its own noise.
 
     Example:
@@ -77,12 +77,12 @@ class EKFAnalysis(GaussianAnalysis):
     r"""The Kalman update with the Jacobian H of the observation model at the forecast's mean (Joseph form).
 
     Args:
-        observation: observes ensembles ``[*B, E, S]``; whatever else it reads or writes, such as a mask, it finds and
-            leaves in a copy of the tensordict.
+        observation: observes ensembles ``[*B, E, S]``. Its other inputs and outputs, such as a mask, are read from and
+            written to a copy of the tensordict.
         **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
-        ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
+        ValueError: if the model has random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
         KeyError: if an entry is missing.
 
     Example:
@@ -120,17 +120,17 @@ def _linearise(
     key: NestedKey,
     sides: tuple[Space | None, Space | None] | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Returns value, Jacobian and mask of the model inside a step, which knows its Jacobian or is differentiated.
+    """Returns output, Jacobian and mask of the model inside a step, by its own Jacobian or automatic differentiation.
 
     Args:
-        step: around the model.
+        step: the step around the model.
         model: see :func:`_differentiated`.
-        entries: what the model may read, the mean ``[*B, 1, P]`` among it.
-        call: how it is called.
-        mean: where, ``[*B, P]``.
-        size: numbers of the image, N.
-        key: of the image.
-        sides: of ``mean`` and image, between whose tangents the Jacobian is to lead; ``None`` for plain numbers, of
+        entries: inputs of the model, including the mean ``[*B, 1, P]``.
+        call: the model's call.
+        mean: the mean, ``[*B, P]``.
+        size: dimension of the output, N.
+        key: key of the output.
+        sides: spaces of mean and output, between whose tangents the Jacobian maps; ``None`` for plain numbers, of
             one or both.
     """
     found = linearise(step.module, entries, call)
@@ -153,7 +153,7 @@ def _linearise(
 
 
 def _fit(known: tuple[Space, Space] | None, wanted: tuple[Space | None, Space | None] | None) -> bool:
-    """Tells whether a Jacobian between the tangents of some spaces is one between those of others, or of numbers."""
+    """Tells whether a Jacobian for the known spaces is also that for the wanted ones."""
     if known is None or known == wanted:
         return True
     pairs = zip(known, wanted or (None, None), strict=True)
@@ -167,22 +167,22 @@ def _differentiated(
     mean: Tensor,
     size: int,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Returns value and Jacobian at ``mean`` ``[*B, S]`` of a model of ensembles, in one call of it.
+    """Returns output and Jacobian at ``mean`` ``[*B, S]`` of a model of ensembles, in one call of it.
 
-    The model runs on N copies of the batch, and one backward pass goes from the n-th output of the n-th copy. This
+    The model runs on N copies of the batch, and one backward pass starts at the n-th output of the n-th copy. This
     takes a quarter of the time of torch.func's forward mode, whose Python formulas dominate in small systems, and
-    maps over no dimension that the model could not know. A compiled graph has no Python to save: there the model runs
-    once, and the backward passes are mapped over, which takes half the products. Both results can be differentiated.
+    needs no vmap over a dimension that the model does not know. In a compiled graph Python costs nothing: there the
+    model runs once under a vmap over backward passes, with half the products. Both results can be differentiated.
 
     Args:
-        model: from entries and an ensemble ``[*, 1, S]`` to images ``[*, 1, N]`` and a mask, with ``*`` any batch.
-        entries: what the model may read, ``[*B]``.
-        call: how it is called.
-        mean: where.
-        size: N, the dimension of the images.
+        model: maps entries and an ensemble ``[*, 1, S]`` to outputs ``[*, 1, N]`` and a mask, with ``*`` any batch.
+        entries: inputs of the model, ``[*B]``.
+        call: the model's call.
+        mean: the mean.
+        size: N, the dimension of the outputs.
 
     Returns:
-        The image ``[*B, N]``, the Jacobian ``[*B, N, S]``, and the mask.
+        The output ``[*B, N]``, the Jacobian ``[*B, N, S]``, and the mask.
     """
     copies = () if torch.compiler.is_compiling() else (size,)
     rows = {key: value.expand(*copies, *value.shape) for key, value in entries.items()}
@@ -192,15 +192,15 @@ def _differentiated(
         images, mask = model(rows, states, call)
         if images.shape[-1] != size:
             raise ValueError(
-                f"the model of {mean.shape[-1]} states gives {images.shape[-1]} numbers; {size} are due: an "
-                "observation gives one for each component of its reading, a motion one for each of the state. "
+                f"the model of {mean.shape[-1]} states returns {images.shape[-1]} components instead of {size}: an "
+                "observation returns one for each component of its reading, a motion one for each of the state. "
                 "Earlier states that are kept for late readings count among the states."
             )
         return images, () if mask is None else (mask,)
 
     states = mean.unsqueeze(-2).expand(*copies, *mean.shape[:-1], 1, mean.shape[-1])
     result = torch.func.vjp(run, states, has_aux=True)
-    images, pull_back, masks = result  # type: ignore[misc]  # torch does not say that has_aux makes it three
+    images, pull_back, masks = result  # type: ignore[misc]  # torch's annotation lacks the third result of has_aux
     basis = torch.eye(size, dtype=images.dtype, device=images.device).reshape(size, *[1] * mean.ndim, size)
     if copies:
         (jacobian,) = pull_back(basis.expand_as(images))

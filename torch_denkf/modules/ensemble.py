@@ -1,4 +1,4 @@
-"""Base of the updates of an ensemble: the entries that they read and write."""
+"""Base of the updates of an ensemble, with its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["EnsembleAnalysisKeys", "EnsembleOptions", "EnsembleUpdate", "Rotated
 
 
 class EnsembleAnalysisKeys(TypedDict, total=False):
-    """The keys that an update of an ensemble takes.
+    """The keys of an ensemble update.
 
     Attributes:
         forecast_key: forecast ensemble ``[*B, E, S]``; ``("forecast", "ensemble")`` by default.
@@ -28,10 +28,10 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
             default.
         noise_variance_key: variances ``[*B, O]``; ``("sensor", "noise")`` by default.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; ``"observed"`` by default.
-        belief_prefix: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``;
+        belief_prefix: prefix of the outputs ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``;
             ``"belief"`` by default.
         info_prefix: prefix of the diagnostics: ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``;
-            ``"info"`` by default. Where a filter holds several analyses of one prefix, each has its own,
+            ``"info"`` by default. If a filter has several analyses of one prefix, each writes to
             ``(info_prefix, place, ...)``, and ``nis`` and ``log_likelihood`` under the prefix are their sums.
     """
 
@@ -45,15 +45,15 @@ class EnsembleAnalysisKeys(TypedDict, total=False):
 
 
 class EnsembleOptions(EnsembleAnalysisKeys, total=False):
-    """Arguments of every ensemble update besides its keys.
+    """Arguments of every ensemble update in addition to its keys.
 
     Attributes:
-        inflation: factor on the analysis anomalies, where anything is observed; 1, by default, for none.
+        inflation: factor of the analysis anomalies where anything is observed; 1, by default, for none.
         relaxation: relaxation to prior spread in [0, 1]; 0, by default, for none.
         rotate: random mean-preserving rotation of the anomalies.
-        reading_space: of the reading; ``None`` for plain numbers.
+        reading_space: space of the reading; ``None`` for plain numbers.
         localisation: ``"significance"`` or ``None``.
-        threshold: of ``"significance"``, in standard deviations; 1.5 by default.
+        threshold: threshold of ``"significance"``, in standard deviations; 1.5 by default.
     """
 
     inflation: float
@@ -68,14 +68,14 @@ class Rotated(Update):
     """An update of an ensemble that may rotate its anomalies at random.
 
     Attributes:
-        rotate: whether it does.
+        rotate: whether it rotates them.
     """
 
     rotate: bool = False
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Returns rotations, where wanted."""
+        """Names the rotations, if wanted."""
         return ("",) if self.rotate else ()
 
     def draw_noise(self, batch_size, *, members=None, device=None, dtype=None, generator=None, **_):
@@ -89,7 +89,7 @@ class Rotated(Update):
         return {"members": ensemble.shape[-2]}
 
     def rotated(self, ensemble: Tensor, rotation: Tensor | None) -> Tensor:
-        """Returns the ensemble with its anomalies rotated; as it is without a rotation."""
+        """Returns the ensemble with its anomalies rotated; unchanged without a rotation."""
         if rotation is None:
             return ensemble
         mean = ensemble.mean(-2, keepdim=True)
@@ -100,7 +100,7 @@ class EnsembleUpdate(Rotated):
     """Reads a forecast ensemble, its predicted observations and a reading, writes the belief and the diagnostics.
 
     Args:
-        space: of the state; ``None`` for plain numbers.
+        space: space of the state; ``None`` for plain numbers.
         covariance: also write the belief's sample covariance ``cov`` ``[*B, S, S]``.
         **options: see :class:`EnsembleOptions`.
 
@@ -166,9 +166,9 @@ class EnsembleUpdate(Rotated):
     def aligned(self, entries: Entries) -> Entries:
         """Maps predictions and the reading to plain numbers, see :meth:`~torch_denkf.functional.manifolds.Space.align`.
 
-        They can then be averaged, spread and subtracted like other numbers. Who changes them in front of the analysis
-        does so here, and hands them to :meth:`on_aligned`: another alignment would fold a spread that is wider than a
-        turn.
+        They can then be averaged, spread and subtracted like other numbers. A wrapper that changes them before the
+        analysis must do so here, and pass them to :meth:`on_aligned`: a second alignment would fold a spread of more
+        than one turn.
         """
         if self.reading_space is None:
             return entries
@@ -178,5 +178,5 @@ class EnsembleUpdate(Rotated):
         return {**entries, **aligned, **({} if observed is None else {self.observed_key: observed})}
 
     def on_aligned(self, entries: Entries, call: Call) -> Entries:
-        """Returns the belief and the diagnostics of entries as :meth:`aligned` gives them."""
+        """Returns the belief and the diagnostics for the entries of :meth:`aligned`."""
         return super().on_entries(entries, call)

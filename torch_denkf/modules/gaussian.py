@@ -1,4 +1,4 @@
-"""Bases of the steps of a mean and a covariance: they run ensemble modules, and add Q and R."""
+"""Base classes of steps on a mean and a covariance, which run ensemble modules and add Q and R."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropo
 
 
 class GaussianTransitionKeys(TypedDict, total=False):
-    """The keys that a forecast of mean and covariance takes.
+    """The keys of a forecast of mean and covariance.
 
     Attributes:
         belief_prefix: prefix of ``mean`` ``[*B, S]`` and ``cov`` ``[*B, S, S]`` of the last analysis; ``"belief"`` by
             default.
         forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast, ``"forecast"`` by default.
-        ensemble_key: what the transition reads, ``("belief", "ensemble")`` by default.
-        forecast_ensemble_key: what it writes, ``("forecast", "ensemble")`` by default.
-        space: in which the state lives; ``None`` by default, for plain numbers. Covariances and Q are of tangents.
+        ensemble_key: input of the transition, ``("belief", "ensemble")`` by default.
+        forecast_ensemble_key: its output, ``("forecast", "ensemble")`` by default.
+        space: space of the state; ``None`` by default, for plain numbers. Covariances and Q are of tangents.
     """
 
     belief_prefix: str
@@ -42,7 +42,7 @@ class GaussianTransitionKeys(TypedDict, total=False):
 
 
 class GaussianTransition(Transition):
-    """Forecasts mean and covariance through a transition of ensembles; a subclass writes :meth:`_forecast`.
+    """Forecasts mean and covariance through a transition of ensembles; a subclass implements :meth:`_forecast`.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``, e.g. :class:`~torch_denkf.modules.LearnedTransition`.
@@ -51,7 +51,7 @@ class GaussianTransition(Transition):
         **keys: see :class:`GaussianTransitionKeys`.
 
     Raises:
-        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
+        ValueError: if the transition has random layers outside a :class:`~torch_denkf.modules.StochasticMLP`, or
             draws its own noise.
     """
 
@@ -85,9 +85,10 @@ class GaussianTransition(Transition):
         return self.with_link(entries, call, wanted=False)[0]
 
     def with_link(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, Sequence[torch.Tensor]]:
-        """Returns the forecast; and, where wanted, how it follows from the state before: A, M, B and Q.
+        """Returns the forecast; and, if wanted, its linear relation to the state before: A, M, B and Q.
 
-        The covariance before is A M Aᵀ, that of the states before and after is A M Bᵀ, the forecast's B M Bᵀ + Q.
+        The covariance before is A M Aᵀ, the covariance of the states before and after is A M Bᵀ, and the forecast's is
+        B M Bᵀ + Q.
         """
         mean, cov = (self.required(entries, key) for key in self.in_keys[:2])
         mean, cov, link = self._forecast(entries, mean, cov, call._replace(sample=False), wanted)
@@ -97,29 +98,30 @@ class GaussianTransition(Transition):
         return {self.out_keys[0]: mean, self.out_keys[1]: cov + noise}, (*(link or ()), noise)
 
     def mask_of(self, entries: Entries, written: Entries) -> None:
-        """Returns that a forecast has no mask."""
+        """Returns ``None``: a forecast has no mask."""
 
     def _forecast(
         self, entries: Entries, mean, cov, call: Call, wanted: bool
     ) -> tuple[torch.Tensor, torch.Tensor, Sequence[torch.Tensor] | None]:
-        """Returns mean and covariance before the process noise is added, and where wanted A, M and B."""
+        """Returns mean and covariance before the process noise is added, and if wanted A, M and B."""
         raise NotImplementedError
 
     def _move(self, entries: Entries, states: torch.Tensor, call: Call) -> torch.Tensor:
-        """Returns the transition of an ensemble ``[*B, E, S]``."""
-        with deterministic(self.module):  # also of networks that do not know about calls
+        """Returns the forecast of an ensemble ``[*B, E, S]`` by the transition."""
+        with deterministic(self.module):  # for networks that do not read ``call.sample``
             return run_module(self.module, {**entries, self.ensemble_key: states}, call)[self.forecast_ensemble_key]
 
 
 class GaussianAnalysisOptions(TypedDict, total=False):
-    """Declares the options of an update of mean and covariance, next to the observation model.
+    """Options of an update of mean and covariance, in addition to the observation model.
 
     Attributes:
-        inflation: factor on the belief's standard deviations, where anything is observed; 1 by default, for none. What
-            is never observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
-        space: in which the state lives; ``None`` by default, for plain numbers. ``cov`` and ``var`` are of the tangents
+        inflation: factor of the belief's standard deviations where anything is observed; 1 by default, for none. It
+            makes components that are never observed, such as a vehicle's position, grow without bound: there scale Q
+            and R instead.
+        space: space of the state; ``None`` by default, for plain numbers. ``cov`` and ``var`` are of the tangents
             at ``mean``.
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle, whose innovation is wrapped to
+        reading_space: space of the reading, such as ``Circle()`` for an angle, whose innovation is wrapped to
             [-pi, pi); ``None`` by default, for plain numbers. Innovation and R are tangents.
         observation_key: learned observations ``[*B, E, O]``, whose mean is used, or readings ``[*B, O]``;
             ``("sensor", "ensemble")`` by default.
@@ -131,8 +133,8 @@ class GaussianAnalysisOptions(TypedDict, total=False):
             default.
         info_prefix: prefix of ``innovation`` ``[*B, O]``, ``nis`` and ``log_likelihood`` ``[*B, 1]``; ``"info"`` by
             default.
-        ensemble_key: what the observation model reads, ``("forecast", "ensemble")`` by default.
-        predicted_key: what it writes, ``("forecast", "observation")`` by default.
+        ensemble_key: input of the observation model, ``("forecast", "ensemble")`` by default.
+        predicted_key: its output, ``("forecast", "observation")`` by default.
     """
 
     inflation: float
@@ -149,15 +151,15 @@ class GaussianAnalysisOptions(TypedDict, total=False):
 
 
 class GaussianAnalysis(Update):
-    """Updates mean and covariance through an observation model of ensembles; a subclass writes :meth:`_update`.
+    """Updates mean and covariance through an observation model of ensembles; a subclass implements :meth:`_update`.
 
     Args:
-        observation: observes ensembles ``[*B, E, S]``; whatever else it reads or writes, such as a mask, it finds and
-            leaves in a copy of the tensordict.
+        observation: observes ensembles ``[*B, E, S]``. Its other inputs and outputs, such as a mask, are read from and
+            written to a copy of the tensordict.
         **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
-        ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
+        ValueError: if the model has random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
         KeyError: if an entry is missing.
     """
 
@@ -202,12 +204,12 @@ class GaussianAnalysis(Update):
     def _innovation(
         self, observation: torch.Tensor, predicted: torch.Tensor, observed: torch.Tensor | None
     ) -> torch.Tensor:
-        """Computes the innovation ``[*B, O]`` from predictions ``[*B, Q]``, of angles the shorter way round."""
+        """Computes the innovation ``[*B, O]`` from predictions ``[*B, Q]``, with angles wrapped."""
         space = self.reading_space
         return observation - predicted if space is None else space.innovation(observation, predicted, observed)
 
     def _moved(self, mean: torch.Tensor, update: GaussianUpdate) -> GaussianUpdate:
-        """Returns an update of the tangents at ``mean``, as a point and the covariance of the tangents there."""
+        """Converts an update in tangents at ``mean`` to a point and the covariance of the tangents at that point."""
         if self.space is None:
             return update._replace(mean=mean + update.mean)
         if is_flat(self.space):
@@ -217,13 +219,13 @@ class GaussianAnalysis(Update):
         return update._replace(mean=self.space.compose(mean, move), cov=(cov + cov.mT) / 2)
 
     def reading_dims(self, entries, call):
-        """Returns O, as the model predicts it."""
+        """Returns the size of the model's predictions, O, and of the noise."""
         mean = self.required(entries, self.in_keys[0])
         size = self._observe(entries, mean.unsqueeze(-2), call._replace(sample=False))[0].shape[-1]
         return [size, size if self.reading_space is None else self.reading_space.tangent_dim]
 
     def with_mask(self, entries, call):
-        """Returns the entries with the mask, where the observation model makes it."""
+        """Returns the entries with the mask, if the observation model computes it."""
         if self.observed_key not in writes(self.module):
             return entries
         mean = self.required(entries, self.in_keys[0])
@@ -243,7 +245,7 @@ class GaussianAnalysis(Update):
         return written[self.predicted_key], self.mask_of(entries, written)
 
     def mask_of(self, entries: Entries, written: Entries) -> torch.Tensor | None:
-        """Returns the mask of what the observation model was given, and of what it wrote."""
+        """Returns the mask of the observation model, combined with the given one."""
         given, made = entries.get(self.observed_key), written.get(self.observed_key)
         return narrowed_mask(self.reading_space, given if made is None else made if given is None else made & given)
 
@@ -251,7 +253,7 @@ class GaussianAnalysis(Update):
 def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: float = 1.0) -> tuple[torch.Tensor, ...]:
     """Returns mean, cov, var, innovation, nis and log_likelihood.
 
-    ``inflation`` multiplies the belief's standard deviations where anything is observed.
+    ``inflation`` multiplies the belief's standard deviations if anything is observed.
     """
     cov = update.cov
     if inflation != 1.0:
@@ -263,14 +265,14 @@ def updated(update: GaussianUpdate, observed: torch.Tensor | None, inflation: fl
 def further_keys(
     modules: Iterable[TensorDictModuleBase], known: Iterable[NestedKey]
 ) -> tuple[list[NestedKey], list[NestedKey]]:
-    """Returns the keys that ``modules`` must find, and those that they may, next to the entries ``known``."""
+    """Returns the required and the optional keys of ``modules``, without the entries ``known``."""
     known, read = set(map(unravel_key, known)), list(map(reads, modules))
     needed, optional = ([key for keys in read for key in keys[kind] if key not in known] for kind in (0, 1))
     return list(dict.fromkeys(needed)), list(dict.fromkeys(optional))
 
 
 def check_no_random_layers(module: nn.Module, owner: str) -> None:
-    """Raises where a module would stay random although its stochastic networks run their deterministic forward.
+    """Raises if a module would stay random although its stochastic networks run their deterministic forward.
 
     Raises:
         ValueError: if there are dropout or flipout layers outside a :class:`StochasticMLP`, or sub-models that draw
@@ -287,7 +289,7 @@ def check_no_random_layers(module: nn.Module, owner: str) -> None:
     ]
     if random:
         raise ValueError(
-            f"{owner} needs a deterministic model; {type(module).__name__} holds random parts ({random}). Put random "
+            f"{owner} needs a deterministic model; {type(module).__name__} has random parts ({random}). Put random "
             "layers into a StochasticMLP, whose mean network is then used, or take them out: the noise of this filter "
             "is in its covariances."
         )

@@ -1,4 +1,4 @@
-"""The exact linear-Gaussian filter in modules: initial beliefs, transition, analysis of mean and covariance."""
+"""Modules of the exact linear-Gaussian filter: initial beliefs, transition, and update of mean and covariance."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class MomentPrior(Initial):
 
     Args:
         mean: ``[S]``; on a space a point.
-        cov: ``[S, S]``; on a space of the tangents at ``mean``.
-        space: in which the state lives; ``None`` for plain numbers.
+        cov: ``[S, S]``; on a space the covariance of the tangents at ``mean``.
+        space: space of the state; ``None`` for plain numbers.
         belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` and ``var`` ``[*B, S]``.
 
     Raises:
@@ -68,7 +68,7 @@ class GaussianAround(Initial):
     Args:
         std: standard deviations ``[S]``, in the state's units; zero where the state is known exactly.
         state_key: the known state ``[*B, S]``.
-        space: in which the state lives; ``None`` for plain numbers. ``std`` is of the tangents.
+        space: space of the state; ``None`` for plain numbers. ``std`` is of the tangents.
         belief_prefix: prefix of ``mean`` ``[*B, S]``, ``cov`` ``[*B, S, S]`` (diagonal) and ``var`` ``[*B, S]``.
 
     Raises:
@@ -170,13 +170,13 @@ class LinearTransition(Transition):
         return self.with_link(entries, call, wanted=False)[0]
 
     def with_link(self, entries: Entries, call: Call, *, wanted: bool = True) -> tuple[Entries, Sequence[torch.Tensor]]:
-        """Returns the forecast, and how it follows from the state before, see :class:`GaussianTransition`."""
+        """Returns the forecast, and its linear relation to the state before, see :class:`GaussianTransition`."""
         mean, cov = entries.get(self.in_keys[0]), entries.get(self.in_keys[1])
         if mean is None or cov is None:
-            mean, cov = self.values(entries)[:2]  # raises, and says what there is
+            mean, cov = self.values(entries)[:2]  # raises with a message that lists the entries
         noise = self.noise
         constant = noise if isinstance(noise, torch.Tensor) else torch.zeros_like(cov)
-        # A module's is added below, because it may read the forecast's mean.
+        # The noise of a module is added below, because it may depend on the forecast's mean.
         forecast, forecast_cov = kalman_predict(mean, cov, self.matrix, constant)
         if self.control is not None:
             forecast = forecast + self.required(entries, self.action_key).to(mean.dtype) @ self.control.mT
@@ -198,13 +198,14 @@ class KalmanAnalysis(Update):
         matrix: H, ``[O, S]``.
         noise: R, variances ``[O]`` or a covariance ``[O, O]``; ``None`` to read it from ``noise_variance_key``.
         trainable: whether H is a parameter.
-        inflation: factor on the belief's standard deviations, where anything is observed; 1 for none. What is never
-            observed, such as a vehicle's position, grows by it without bound: scale Q and R there.
-        reading_space: in which the reading lives, one of numbers and angles such as ``Euclidean(1) * Circle()``;
+        inflation: factor of the belief's standard deviations where anything is observed; 1 for none. It makes
+            components that are never observed, such as a vehicle's position, grow without bound: there scale Q and R
+            instead.
+        reading_space: space of the reading, made of numbers and angles, such as ``Euclidean(1) * Circle()``;
             ``None`` for plain numbers.
         observation_key: readings ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used; in a filter
-            these stand under a key whose last name is ``"ensemble"``.
-        noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, where ``noise`` is ``None``.
+            these are stored under a key whose last name is ``"ensemble"``.
+        noise_variance_key: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``, if ``noise`` is ``None``.
         observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``.
         forecast_prefix: prefix of ``mean`` and ``cov`` of the forecast.
         belief_prefix: prefix of ``mean``, ``cov`` and ``var``.
@@ -255,7 +256,7 @@ class KalmanAnalysis(Update):
         register_constant(self, "noise", noise)
         check_number("inflation", inflation, above=0)
         if self.reading_space is not None and self.reading_space.point_dim != len(self.matrix):
-            raise ValueError(f"reading_space={reading_space} is not one of the {len(self.matrix)} rows of matrix.")
+            raise ValueError(f"reading_space={reading_space} does not fit the {len(self.matrix)} rows of matrix.")
         if self.noise is not None and self.noise.ndim == 2:
             check_covariance("noise", self.noise, len(self.matrix), "[O] or [O, O]")
         elif self.noise is not None:
@@ -264,11 +265,11 @@ class KalmanAnalysis(Update):
         self.reading_keys, self.observed_key = self.in_keys[2:], unravel_key(observed_key)
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns ``H x`` of states ``[*, S]``; NaN where it reads a dimension that is NaN."""
+        """Returns ``H x`` for states ``[*, S]``; NaN for rows that use a dimension that is NaN."""
         return product_of_known(self.matrix, state)
 
     def reading_dims(self, entries, call):
-        """Returns O, the rows of H."""
+        """Returns O, the number of rows of H."""
         return [len(self.matrix)] * len(self.reading_keys)
 
     def compute(self, mean, cov, observation, *rest):
@@ -277,7 +278,7 @@ class KalmanAnalysis(Update):
         noise = noise[0] if noise else self.noise.expand(*mean.shape[:-1], *self.noise.shape)
         if observation.ndim > mean.ndim:
             observation = mean_reading(self.reading_space, observation, None)
-        if self.reading_space is not None:  # the same turn as the prediction
+        if self.reading_space is not None:  # on the same turn as the prediction
             predicted = mean @ self.matrix.mT
             observation = predicted + self.reading_space.minus(observation, predicted)
         update = kalman_update(mean, cov, observation, self.matrix, noise, observed=observed)

@@ -1,4 +1,4 @@
-"""An image trunk for arms: where things are in the picture, and what it looks like as a whole."""
+"""An image trunk for robot arms: keypoint positions in the image, and pooled features of the whole image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["KeypointTrunk", "SpatialSoftArgmax"]
 
 
 class SpatialSoftArgmax(nn.Module):
-    """Computes the mean place of each channel under the softmax of its values.
+    """Computes the mean position of each channel under the softmax of its values.
 
     Args:
         channels: C.
@@ -37,7 +37,7 @@ class SpatialSoftArgmax(nn.Module):
         self.log_sharpness = nn.Parameter(torch.zeros(channels, 1))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Returns mean places."""
+        """Returns mean positions."""
         height, width = features.shape[-2:]
         place = (features.flatten(-2) * self.log_sharpness.exp()).softmax(-1).unflatten(-1, (height, width))
         columns, rows = (torch.linspace(-1, 1, n, device=place.device, dtype=place.dtype) for n in (width, height))
@@ -45,17 +45,17 @@ class SpatialSoftArgmax(nn.Module):
 
 
 class KeypointTrunk(nn.Module):
-    """Convolutions that also see their place in the picture, read out as places and as averages.
+    """Convolutions with pixel coordinates as further inputs, whose outputs are keypoint positions and averages.
 
-    A flat layer over all pixels, as Table I has it, must learn each place by itself. Joint angles follow from where
-    the links are, so that this trunk needs fewer demonstrations.
+    A fully connected layer over all pixels, as in Table I, must learn each position separately. Joint angles depend on
+    the positions of the links, so that this trunk needs fewer demonstrations.
 
     Args:
         in_channels: C of the images.
-        channels: of the convolutions, of stride 2 each; group normalisation and ReLU behind each.
-        keypoints: channels whose places are read.
+        channels: channels of the convolutions, of stride 2 each, with group normalisation and ReLU.
+        keypoints: number of keypoints, one channel each.
         features: width of the output.
-        pooled: the last map is averaged over a grid of so many rows and columns besides the keypoints.
+        pooled: rows and columns of the grid over which the last map is averaged, in addition to the keypoints.
 
     Shape:
         ``[N, C, H, W]`` to ``[N, features]``, for any H and W from ``2 ** (len(channels) - 1)`` on.
@@ -87,7 +87,7 @@ class KeypointTrunk(nn.Module):
             )
             for first, before, after in zip([True] + [False] * len(channels), widths, widths[1:], strict=False)
         ]
-        # Places are read where the map is still fine: one block before the last.
+        # Positions are read from a map of finer resolution: one block before the last.
         self.stem, self.last = nn.Sequential(*blocks[:-1]), blocks[-1]
         self.places = nn.Sequential(nn.Conv2d(widths[-2], keypoints, 1), SpatialSoftArgmax(keypoints))
         self.pool = nn.Sequential(nn.AdaptiveAvgPool2d(pooled), nn.Flatten())

@@ -1,4 +1,4 @@
-r"""Likelihoods of particles: how well each one's predicted observation :math:`h(x^i)` explains what the sensor saw."""
+r"""Likelihoods of particles: compare each particle's predicted observation :math:`h(x^i)` with the reading."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from torch_denkf.submodel import Update
 
 __all__ = ["GaussianLikelihood", "LearnedLikelihood"]
 
-#: Jonschkowski et al.: the smallest likelihood, so that no particle dies of a single reading.
+#: Jonschkowski et al.: the smallest likelihood, so that a single reading removes no particle.
 _SMALLEST_LIKELIHOOD = 0.004
 #: Kloss et al.: the smallest log-likelihood.
 _SMALLEST_LOG_LIKELIHOOD = -20.0
 
 
 class GaussianLikelihood(Update):
-    r"""Log-density of the reading around each particle's prediction, :math:`\log N(\tilde y; h(x^i), R)`.
+    r"""Computes the log-density of the reading around each particle's prediction, :math:`\log N(\tilde y; h(x^i), R)`.
 
-    Dimensions that are not observed, or whose variance is infinite, drop out; where nothing is observed it is zero for
-    all particles.
+    Unobserved dimensions, and those of infinite variance, are left out; if nothing is observed it is zero for all
+    particles.
 
     Args:
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle; ``None`` for plain numbers.
+        reading_space: space of the reading, such as ``Circle()`` for an angle; ``None`` for plain numbers.
             Variances are of tangents.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
         observation_key: one reading ``[*B, O]``, or learned observations ``[*B, E, O]``, whose mean is used.
         noise_variance_key: variances ``[*B, O]``, the diagonal of R.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; what is not may be NaN.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``, ``True`` where observed; missing readings may be NaN.
         out_key: log-likelihoods ``[*B, E]``, in nats.
 
     Raises:
@@ -82,7 +82,7 @@ class GaussianLikelihood(Update):
         if reading.ndim > len(batch_size) + 1:
             reading = mean_reading(self.reading_space, reading, observed)
         reading = reading.unsqueeze(-2)
-        if self.reading_space is not None:  # from each particle by itself: they may lie all around
+        if self.reading_space is not None:  # for each particle separately: they may be spread over a full turn
             mask = None if observed is None else observed.unsqueeze(-2)
             reading = self.reading_space.innovation(reading, predicted, mask)
             predicted = torch.zeros_like(reading)
@@ -93,7 +93,7 @@ class GaussianLikelihood(Update):
             raise ValueError(f"GaussianLikelihood compares vectors of one width; their widths are {widths}.")
         variance = variance.unsqueeze(-2)
         if observed is not None:
-            # With the reading replaced, not only the residual, NaN reaches neither values nor gradients.
+            # The reading is replaced, not only the residual, so that NaN reaches neither values nor gradients.
             observed = observed.unsqueeze(-2)
             reading, variance = torch.where(observed, reading, 0.0), torch.where(observed, variance, 1.0)
         residual = reading - predicted
@@ -103,21 +103,21 @@ class GaussianLikelihood(Update):
 
 
 class LearnedLikelihood(Update):
-    r"""A learned likelihood: a network looks at the sensor's encoding and at a particle's predicted observation.
+    r"""Computes a learned likelihood from the sensor's encoding and a particle's predicted observation.
 
     .. math:: \log l^i = b(g(e \oplus (h(x^i) - m) / s))
 
-    It needs no noise model and is not normalised over readings. The bound b keeps a single reading from killing all
-    particles. Where nothing is observed it is zero for all particles; where some dimensions are, the network sees the
-    mean of the others in place of the particle's.
+    It needs no noise model and is not normalised over readings. The bound b prevents a single reading from removing
+    all particles. If nothing is observed it is zero for all particles; if only some dimensions are, the network
+    reads the mean of the others instead of the particle's values.
 
-    So it is in the papers, where the encoding must say what was read. A network that is trained on few recordings does
-    not find that in the encodings of new ones. Where a trained sensor is at hand, ``observation_key`` tells it the
-    innovation instead:
+    This is the form of the papers, in which the encoding has the information about the reading. A network trained on
+    few recordings does not generalise to the encodings of new ones. With a trained sensor, ``observation_key`` gives
+    the network the innovation instead:
 
     .. math:: \log l^i = b(g(e \oplus \mathrm{sign}(d^i) \log(1 + |d^i|))), \quad d^i = (y - h(x^i)) / s
 
-    whose logarithm resolves the near particles and keeps the far ones in range.
+    The logarithm resolves near particles and limits the range of distant ones.
 
     Args:
         encoding_dim: F, size of the encoding.
@@ -125,17 +125,17 @@ class LearnedLikelihood(Update):
         num_cells: hidden layers; both papers have (128, 128).
         bound: ``"scaled"``, :math:`\log(0.004 + 0.996\, \mathrm{sigmoid}(g))` (Jonschkowski et al. 2018), or
             ``"clipped"``, :math:`\max(\log \mathrm{sigmoid}(g), -20)` (the limit of Kloss et al. 2021).
-        loc: mean m of each observation dimension ``[O]``; zero by default. Not with a ``observation_key``.
-        scale: s of each observation dimension ``[O]``: its standard deviation, or with a ``observation_key`` what a
-            good reading errs by; one by default.
-        reading_space: in which the reading lives, one of numbers and angles; with a ``observation_key``.
+        loc: mean m of each observation dimension ``[O]``; zero by default. Not with an ``observation_key``.
+        scale: s of each observation dimension ``[O]``: its standard deviation, or with an ``observation_key`` the
+            usual error of a reading; one by default.
+        reading_space: space of the reading, made of numbers and angles; only with an ``observation_key``.
         network: maps ``[*, F + O]`` to ``[*, 1]``; a multi-layer perceptron with ``num_cells`` by default.
-        encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; of an entry ``[*B, E, F]`` the
+        encoding_key: the encoding ``[*B, F]``, such as a sensor's ``encoding_key``; for an entry ``[*B, E, F]`` the
             mean is used.
-        observation_key: what a trained sensor read, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used. Nothing by
+        observation_key: output of a trained sensor, ``[*B, O]`` or ``[*B, E, O]``, whose mean is used. ``None`` by
             default, as in the papers.
         predicted_key: predicted observations ``[*B, E, O]``, in the observation's units.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames of which nothing is observed may
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; encodings of frames without any observation may
             be NaN.
         out_key: log-likelihoods ``[*B, E]``, in nats, up to a constant.
 
@@ -146,8 +146,8 @@ class LearnedLikelihood(Update):
 
     Reference:
         Jonschkowski, Rastogi & Brock, "Differentiable particle filters", 2018, arXiv:1805.11122;
-        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313. There the
-        particle's state goes into the network; its predicted observation is all of it that a reading can tell.
+        Kloss, Martius & Bohg, "How to train your differentiable filter", 2021, arXiv:2012.14313. Their network reads
+        the particle's state; its predicted observation has all information that a reading can confirm.
 
     Example:
         >>> from tensordict import TensorDict
@@ -176,12 +176,12 @@ class LearnedLikelihood(Update):
         check_choice("bound", bound, ("scaled", "clipped"))
         if loc is not None and observation_key is not None:
             raise ValueError(
-                "with a observation_key the network sees the innovation, which has no loc; pass scale alone."
+                "with an observation_key the network reads the innovation, which has no loc; pass only scale."
             )
         space = check_space("reading_space", reading_space, flat=True)
         if space is not None and (observation_key is None or space.point_dim != observation_dim):
             raise ValueError(
-                f"reading_space={reading_space} is that of a reading of {observation_dim}, with a observation_key."
+                f"reading_space={reading_space} must fit a reading of {observation_dim}, with an observation_key."
             )
         check_count("encoding_dim", encoding_dim)
         check_count("observation_dim", observation_dim)

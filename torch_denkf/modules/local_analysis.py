@@ -1,4 +1,4 @@
-"""The local ensemble transform (LETKF) as a TensorDict module: each component learns from the observations near it."""
+"""The local ensemble transform (LETKF) as a TensorDict module: updates each component from nearby observations."""
 
 from __future__ import annotations
 
@@ -17,41 +17,39 @@ from torch_denkf.modules.tensors import check_untrained, mean_of_members
 
 __all__ = ["LocalEnsembleAnalysis"]
 
-_CHOSEN_ONCE = "which observations count, and how much, is found once"
+_CHOSEN_ONCE = "the neighbours and their weights are computed once"
 
 
 class LocalEnsembleAnalysis(EnsembleUpdate):
-    """Updates each component of the state from the observations near it; the mathematics is
-    :func:`~torch_denkf.functional.letkf`.
+    """Updates each component of the state from the observations near it, see :func:`~torch_denkf.functional.letkf`.
 
-    For fields, where a few members stand for thousands of components: what they show of a covariance far away is
-    chance. It takes the place of :class:`EnsembleAnalysis` and reads and writes the same keys. Nothing of size S x O is
-    kept; S local systems, E x E each, are solved ``tile`` at a time.
+    It is for fields, in which a few members represent thousands of components, and covariances of distant components
+    are due to chance. It replaces :class:`EnsembleAnalysis` and has the same inputs and outputs. Nothing of size S x O
+    is stored; S local systems, E x E each, are solved ``tile`` at a time.
 
-    ``nis`` and ``log_likelihood`` take each observation by itself, with the variance of its own forecast plus R: the
-    correlations that E members show between observations are what localisation does not believe. The expectation of
+    ``nis`` and ``log_likelihood`` treat observations as independent, each with the variance of its own forecast plus
+    R: the localisation suppresses the sample correlations of E members between observations. The expectation of
     ``nis`` is the number of observations, if the filter is consistent.
 
     Args:
-        near: which observations count where: :class:`~torch_denkf.functional.localisation.Neighbours`, or a taper ``[S,
-            O]``. From places and a radius: :meth:`around`.
-        inflation: factor on the analysis anomalies of the components near which anything is observed; 1 for none.
+        near: the observations of each component: :class:`~torch_denkf.functional.localisation.Neighbours`, or a taper
+            ``[S, O]``. For positions and a radius, see :meth:`around`.
+        inflation: factor of the analysis anomalies of components with an observation nearby; 1 for none.
         relaxation: relaxation to prior spread in [0, 1]; 0 for none.
-        rotate: random mean-preserving rotation of the anomalies, the same for all components; rows of which nothing
-            is observed are not rotated.
-        tile: components to analyse in one go; memory is ``E * L * tile`` for each element of the batch, with L
+        rotate: random mean-preserving rotation of the anomalies, the same for all components; rows without any
+            observation are not rotated.
+        tile: components to analyse at a time; memory is ``E * L * tile`` for each element of the batch, with L
             neighbours.
-        localisation: ``"significance"`` also weighs each observation near a component by how far E members can tell
-            their correlation from chance, see :class:`EnsembleAnalysis`.
-        threshold: of ``"significance"``, in standard deviations; a ``Parameter`` is trained.
-        reading_space: in which the reading lives, such as ``Circle()`` for an angle; innovation and R are tangents.
-        **options: those above that every update of an ensemble has, see
-            :class:`~torch_denkf.modules.ensemble.EnsembleOptions`, and the keys,
-            :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. Of learned observations the mean is taken. What
-            is not observed may be NaN, readings and variances alike.
+        localisation: ``"significance"`` also weighs each observation near a component by the significance of their
+            correlation, see :class:`EnsembleAnalysis`.
+        threshold: threshold of ``"significance"``, in standard deviations; a ``Parameter`` is trained.
+        reading_space: space of the reading, such as ``Circle()`` for an angle; innovation and R are tangents.
+        **options: common options of ensemble updates, see :class:`~torch_denkf.modules.ensemble.EnsembleOptions`, and
+            the keys, :class:`~torch_denkf.modules.ensemble.EnsembleAnalysisKeys`. Learned observations are averaged.
+            Missing readings and their variances may be NaN.
 
     Raises:
-        ValueError: if a taper is not a matrix or asks for a gradient, or the sizes do not fit.
+        ValueError: if a taper is not a matrix or requires a gradient, or the sizes do not fit.
         KeyError: if an entry is missing.
 
     Source:
@@ -94,18 +92,18 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         period: torch.Tensor | list[float] | None = None,
         **kwargs,
     ) -> LocalEnsembleAnalysis:
-        """Builds the analysis from places, with Gaspari & Cohn's taper.
+        """Builds the analysis from positions, with Gaspari & Cohn's taper.
 
         Args:
-            states: places of the components, ``[S, D]``, in any unit.
-            observations: places of the observations, ``[O, D]``.
+            states: positions of the components, ``[S, D]``, in any unit.
+            observations: positions of the observations, ``[O, D]``.
             radius: see :func:`~torch_denkf.functional.localisation.gaspari_cohn`; the taper ends at 3.65 radii. It is a
-                constant: which observations are near is found once.
-            period: ``[D]``, circumferences of those coordinates that are circles, ``inf`` for the others.
+                constant, because neighbours are computed once.
+            period: ``[D]``, the circumference of each circular coordinate, ``inf`` for the others.
             **kwargs: passed on to the constructor.
 
         Raises:
-            ValueError: if the radius is not positive, or asks for a gradient.
+            ValueError: if the radius is not positive, or requires a gradient.
         """
         check_untrained("radius", radius, _CHOSEN_ONCE)
         period = None if period is None else torch.as_tensor(period, dtype=states.dtype)
@@ -129,7 +127,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
     def move_past(self, past, predicted, observation, variance, observed=None, *, noise=None):
         """Updates earlier states ``[*B, E, L, S]``, see :meth:`EnsembleAnalysis.move_past`.
 
-        Each component learns from the observations near it now. What moves far in L steps needs a larger radius.
+        Each component is updated from the observations near its present position. Features that move far in L steps
+        need a larger radius.
         """
         observation = mean_of_members(observation, predicted.shape[:-2])
         lag, flat = past.shape[-2], past.flatten(-2)
@@ -139,7 +138,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         return moved.unflatten(-1, past.shape[-2:])
 
     def _analyse(self, ensemble, predicted, observation, variance, observed, noise, copies: int) -> torch.Tensor:
-        """Returns the analysis of ``copies`` states side by side, rotated."""
+        """Returns the analysis of ``copies`` states, concatenated along components, with rotated anomalies."""
         index, taper = self.index, self.taper
         if copies > 1:
             index, taper = index.repeat(copies, 1), taper.repeat(copies, 1)
@@ -148,7 +147,7 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
         return self.rotated(letkf(ensemble, predicted, observation, variance, near, **options), noise)
 
     def _reached(self, observed: torch.Tensor | None, variance: torch.Tensor) -> torch.Tensor:
-        """Marks components near which anything is observed, ``[S]`` or ``[*B, S]``."""
+        """Marks components with an observation nearby, ``[S]`` or ``[*B, S]``."""
         near = self.taper > 0
         if observed is None or observed.shape[-1] < variance.shape[-1]:
             return near.any(-1)
@@ -157,8 +156,8 @@ class LocalEnsembleAnalysis(EnsembleUpdate):
 
 
 def _diagnostics(predicted, observation, variance, observed) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Returns innovation, its normalised square and its log-likelihood, each observation by itself."""
-    if observed is not None:  # before anything is computed, so that a NaN behind the mask spoils no gradient
+    """Returns innovation, its normalised square and its log-likelihood, for independent observations."""
+    if observed is not None:  # first, so that a masked NaN reaches no gradient
         predicted = torch.where(observed.unsqueeze(-2), predicted, 0)
         observation, variance = torch.where(observed, observation, 0), torch.where(observed, variance, 1)
     innovation = observation - predicted.mean(-2)

@@ -1,4 +1,4 @@
-r"""Process noise of an ensemble, where the transition has none or too little of its own."""
+r"""Process noise of an ensemble, for transitions that have none or too little."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ __all__ = ["NoisyTransition"]
 class NoisyTransition(Transition):
     r"""A transition with Gaussian process noise :math:`N(0, Q)` in some or all dimensions of the state.
 
-    An ensemble without process noise collapses: its members come together, and its intervals become too narrow. Where
-    the transition has no noise of its own, or too little, this adds it; Q is written by the same modules as in a filter
-    with a covariance.
+    An ensemble without process noise collapses: its members approach each other, and its intervals become too narrow.
+    This adds noise to a transition that has none, or too little; Q comes from the same modules as in a filter with a
+    covariance.
 
     Args:
         transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
@@ -37,14 +37,14 @@ class NoisyTransition(Transition):
         noise: standard deviations ``[N]``, with N the number of ``dims``, or a module that writes Q: variances
             ``[*B, N]`` or a covariance ``[*B, N, N]``, see :mod:`torch_denkf.modules.process_noise`. It may read the
             belief's (weighted) mean at ``mean_key`` and, unless ``before``, the forecast's at ``forecast_mean_key``,
-            which are worked out for it.
-        dims: state dimensions that the noise acts on, in the order of Q; ``None`` for all.
-        before: True adds the noise to the state *before* it moves. What moves with these dimensions then moves with
-            their noise, such as the pose of a vehicle with its velocities.
+            which are computed for it.
+        dims: state dimensions of the noise, in the order of Q; ``None`` for all.
+        before: True adds the noise to the state *before* the transition, so that it also reaches dimensions that
+            depend on the noisy ones, such as the pose of a vehicle on its velocities.
         mean_key: the belief's mean ``[*B, S]``.
         forecast_mean_key: the mean of the forecast before the noise, ``[*B, S]``.
         log_weight_key: optional log-weights of the belief ``[*B, E]``.
-        space: in which the state lives; ``None`` for plain numbers. Noise and ``dims`` are of the tangents.
+        space: space of the state; ``None`` for plain numbers. Noise and ``dims`` are of the tangents.
         draws: ``"exact"`` or ``"random"``, see :func:`~torch_denkf.functional.draws.exact_draws`; weighted particles
             draw at random.
 
@@ -100,7 +100,7 @@ class NoisyTransition(Transition):
         self.register_buffer("dims", None if dims is None else torch.tensor(list(dims)), persistent=False)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
-        """Draws standard-normal values ``[*batch_size, E, N]``; ``None`` where E or the state's size is not known."""
+        """Draws standard-normal values ``[*batch_size, E, N]``; ``None`` if E or the state's size is not known."""
         size = state_dim if self.dims is None else len(self.dims)
         if members is None or size is None:
             return None
@@ -109,7 +109,7 @@ class NoisyTransition(Transition):
 
     @property
     def noise_dim(self) -> int | None:
-        """Returns N, of noise that enters through a matrix; ``None`` where the noise module does more than that."""
+        """Returns N for noise that is mapped by a matrix; ``None`` for any other noise module."""
         noise = self.module["noise"]
         mapped = isinstance(noise, NoiseThrough) and type(noise).on_entries is NoiseThrough.on_entries
         return noise.noise_dim if mapped and runs_as_written(noise) else None
@@ -123,7 +123,7 @@ class NoisyTransition(Transition):
         return dict(self.module.items())
 
     def on_entries(self, entries, call):
-        """Returns the forecast ensemble, and whatever else the transition writes."""
+        """Returns the forecast ensemble, and all other outputs of the transition."""
         key, out_key = unravel_key(self.in_keys[0]), unravel_key(self.out_keys[0])
         state, entries = self.required(entries, key), dict(entries)
         log_weights = entries.get(self.log_weight_key)
@@ -138,8 +138,8 @@ class NoisyTransition(Transition):
         return written
 
     def _mean(self, key: NestedKey, members: torch.Tensor, log_weights: torch.Tensor | None) -> torch.Tensor:
-        """Returns the mean for the parts, or any member where none reads its numbers."""
-        parts = [part for part in self.module.values() if type(part) is not ConstantNoise]  # it reads a dtype alone
+        """Returns the mean for the parts, or any member if no part uses its values."""
+        parts = [part for part in self.module.values() if type(part) is not ConstantNoise]  # it uses only the dtype
         if not any(key in keys for part in parts for keys in reads(part)):
             return members[..., 0, :]
         if self.space is not None:
@@ -164,7 +164,7 @@ class NoisyTransition(Transition):
         normal = cast("torch.Tensor | None", self._noise(entries, [ensemble], call))
         if normal is None:
             return ensemble
-        normal = normal[..., : covariance.shape[-1]]  # a point may have more numbers than its tangent
+        normal = normal[..., : covariance.shape[-1]]  # a point may have more components than its tangent
         check_shape(f"noise {call.place!r}", normal, (*ensemble.shape[:-1], covariance.shape[-1]), "[*B, E, N]")
         if self.exact and not call.raw and self.log_weight_key not in entries:
             away = ensemble if space is None else space.minus(ensemble, space.near(ensemble).unsqueeze(-2))

@@ -24,7 +24,7 @@ __all__ = ["ConstantNoise", "DiagonalNoise", "ScaledNoise"]
 
 
 class DiagonalNoise(Sensor):
-    r"""A learned diagonal of R from the learned observation, with :math:`R = r^2` before training and a floor.
+    r"""A learned diagonal of R as a function of the observation, with :math:`R = r^2` before training and a floor.
 
     .. math:: R = (r^2 - c)\,(1 + g_\zeta((\tilde y - m) / s))^2 + c
 
@@ -33,13 +33,13 @@ class DiagonalNoise(Sensor):
 
     Args:
         observation_dim: O.
-        r: standard deviation before training, a number or one for each dimension, in the observation's units.
+        r: standard deviation before training, one number or one for each dimension, in the observation's units.
         floor: smallest variance ``c``; 1 % of :math:`r^2` by default.
         num_cells: hidden layers; Table I has (16, 16).
-        in_features: size of the input, O by default; the sensor's encoding has its own.
+        in_features: size of the input, O by default; for a sensor's encoding its size.
         loc: mean :math:`m` of the input ``[in_features]``; zero by default.
         scale: standard deviation :math:`s` of the input ``[in_features]``; one by default.
-        in_key: learned observations ``[*B, E, O]`` (their mean is used) or any ``[*B, in_features]`` entry.
+        in_key: learned observations ``[*B, E, O]`` (their mean is used) or any entry ``[*B, in_features]``.
         out_key: variances ``[*B, O]``.
 
     Raises:
@@ -90,10 +90,10 @@ class ConstantNoise(Sensor):
     """A constant diagonal of R, learned or known.
 
     Args:
-        r: standard deviation of each dimension ``[O]``, in the observation's units; 0 for none, as Q or in a
+        r: standard deviation of each dimension ``[O]``, in the observation's units; 0 for none, only for Q or in a
             :class:`~torch_denkf.filters.KalmanFilter`: ensembles need R > 0.
         trainable: whether log R is a parameter.
-        in_key: any entry of batch shape ``[*B, ...]``, read for its dtype alone.
+        in_key: any entry of batch shape ``[*B, ...]``, of which only the dtype is used.
         out_key: variances ``[*B, O]``.
 
     Raises:
@@ -134,15 +134,15 @@ class ConstantNoise(Sensor):
 class ScaledNoise(Wrapper, Sensor):
     r"""Multiplies the variances of another noise module by the square of a factor that is set by hand after training.
 
-    A filter that is too sure of itself needs more spread. Scaling Q and R by one factor widens its intervals and
-    leaves its gain as it was trained. Inflating the belief itself in every step would also multiply what nothing
-    observes, such as the pose of a vehicle whose velocities are measured, and that would grow without bound.
+    An overconfident filter needs more spread. Scaling Q and R by one factor widens its intervals and keeps its trained
+    gain. Inflating the belief in every step would also multiply components that no reading observes, such as the pose
+    of a vehicle whose velocities are measured, which would grow without bound.
 
-    ``factor`` is no parameter and in no state dict: it is chosen after the training, on validation data.
+    ``factor`` is neither a parameter nor in the state dict: it is chosen after training, on validation data.
 
     Args:
         noise: writes variances ``[*B, N]`` or a covariance ``[*B, N, N]``; its keys are kept.
-        factor: on standard deviations; not negative.
+        factor: factor of the standard deviations; not negative.
 
     Raises:
         ValueError: if the factor is negative.

@@ -21,8 +21,8 @@ class LearnedObservation(MemberNetwork):
     """A learned observation model, deterministic as in Table I (``fc`` layers) or stochastic.
 
     Args:
-        network: maps ``[*, S]`` to ``[*, O]``, e.g. ``StochasticMLP(S, O, layer="none")``; a stochastic one draws for
-            each member.
+        network: maps ``[*, S]`` to ``[*, O]``, e.g. ``StochasticMLP(S, O, layer="none")``; a stochastic network draws
+            for each member.
         loc: mean of each state dimension ``[S]``; the network reads standardised states.
         scale: standard deviation of each state dimension ``[S]``.
         in_key: ensemble to observe ``[*B, E, S]``.
@@ -56,12 +56,12 @@ class LearnedObservation(MemberNetwork):
         return self._run(self.features(ensemble), noise)
 
     def features(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns what the network reads, ``[*, S]``."""
+        """Returns the network's inputs, ``[*, S]``."""
         state = state if self.loc is None else state - self.loc
         return state if self.scale is None else state / self.scale
 
     def jacobian(self, state):
-        """Returns the network's Jacobian, by states in their own units."""
+        """Returns the network's Jacobian with respect to states in their own units."""
         found = jacobian_of_network(self.module, self.features(state), state.shape[-1])
         return found if found is None or self.scale is None else (found[0], found[1] / self.scale)
 
@@ -94,7 +94,7 @@ class Select(SubModel):
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
         """Returns the selected dimensions of states ``[*, S]``."""
-        # Not index_select: inductor (torch 2.13) adds the rows of its Jacobian up.
+        # Not index_select: inductor (torch 2.13) sums the rows of its Jacobian.
         return state.gather(-1, self.dims.expand(*state.shape[:-1], -1))
 
     def compute(self, ensemble):
@@ -133,7 +133,7 @@ class LinearObservation(SubModel):
         register_matrix(self, "matrix", matrix, "[O, S]")
 
     def observe(self, state: torch.Tensor) -> torch.Tensor:
-        """Returns ``H x`` of states ``[*, S]``; NaN where it reads a dimension that is NaN."""
+        """Returns ``H x`` for states ``[*, S]``; NaN for rows that use a dimension that is NaN."""
         return product_of_known(self.matrix, state)
 
     def compute(self, ensemble):

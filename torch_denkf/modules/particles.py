@@ -1,12 +1,12 @@
-r"""Weighted particles: their weights, resampling, the update.
+r"""Weighted particles: initial weights, resampling, and update.
 
 Weights are normalised log-weights ``[*B, E]`` next to the ensemble. The order of a step is
 
     resample -- move -- observe -- weight
 
-so that the belief is what the update leaves: all particles, with their weights. Resampling adds nothing but noise to
-it, and belongs to the step that needs equal particles, the next (as in Jonschkowski et al. 2018). A loss of the belief
-then reaches the likelihood also where no gradient flows through resampling.
+so that the belief after the update has all particles, with their weights. Resampling would only add noise to it, and
+belongs to the next step, which needs equal weights (as in Jonschkowski et al. 2018). A loss of the belief then reaches
+the likelihood even if no gradient flows through resampling.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def with_weights(
 
     Args:
         initial: writes an ensemble ``[*B, E, S]``, see :mod:`torch_denkf.modules.belief`.
-        ensemble_key: what ``initial`` writes.
+        ensemble_key: output of ``initial``.
         log_weight_key: the log-weights, −log E, ``[*B, E]``.
 
     Example:
@@ -66,34 +66,33 @@ def _equal_weights(ensemble_key: NestedKey, belief: Entries, _: torch.Size) -> l
 class ResampledTransition(Transition):
     r"""Resamples the particles of the belief, then moves them.
 
-    Only frames that are observed change weights, so that only in front of those there is something to resample; over
-    missing frames particles and weights go on as they are.
+    Only observed frames change weights, so particles are resampled only before observed frames; over missing frames
+    particles and weights are unchanged.
 
-    A particle that the motion throws out of the numbers (so far that its cube would leave the precision) loses its
-    weight to the others, and goes on next to the heaviest. ``"transport"`` averages particles: one that runs away while
-    it has weight takes the others with it.
+    A particle that diverges (so far that its cube overflows) loses its weight to the others, and is moved to the
+    heaviest one. ``"transport"`` averages particles, so that a diverging particle with weight displaces the others.
 
     Args:
         transition: forecasts an ensemble, ``("belief", "ensemble")`` to ``("forecast", "ensemble")``; its keys are
             kept.
         scheme: ``"systematic"`` (hard, no gradient), ``"soft"`` (hard, but the weights keep a gradient),
-            ``"transport"`` (optimal transport, differentiable, biased) or ``None`` for none at all; see
+            ``"transport"`` (optimal transport, differentiable, biased) or ``None`` for no resampling; see
             :mod:`torch_denkf.functional.resampling` and :func:`~torch_denkf.functional.transport_resample`.
         alpha: share of the uniform distribution in soft resampling.
         epsilon: regularisation of transport.
-        iterations: of Sinkhorn in transport.
-        ess_threshold: share of E; only where fewer particles are effective it is resampled. ``None`` always does.
-        jitter: moves copies apart by a Gaussian kernel of this many times the usual width; 0 for none. For
+        iterations: number of Sinkhorn's iterations in transport.
+        ess_threshold: resamples only if the effective number of particles is below this share of E. ``None``: always.
+        jitter: separates copies by a Gaussian kernel of this many times the usual width; 0 for none. For
             ``"systematic"`` and ``"soft"``; see ``jitter_copies`` in ``functional/resampling.py``.
         log_weight_key: log-weights of the belief ``[*B, E]``.
         out_log_weight_key: log-weights of the forecast ``[*B, E]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of the frame that is moved to.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of the frame after the transition.
         past_key: earlier states of the particles, ``[*B, E, L, S]``, the latest first, which are picked with them; the
-            present one becomes the latest. ``None`` for none. Not for ``"transport"``, which picks no particle.
-        out_past_key: the new past ``[*B, E, L, S]``.
+            present state becomes the latest. ``None`` for none. Not for ``"transport"``, which picks no particle.
+        out_past_key: the new lag window ``[*B, E, L, S]``.
 
     Raises:
-        ValueError: on an unknown ``scheme``, one without use for ``jitter`` or ``past_key``, or numbers out of range.
+        ValueError: on an unknown ``scheme``, a ``jitter`` or ``past_key`` that it cannot use, or numbers out of range.
         KeyError: if an entry is missing.
 
     Example:
@@ -131,11 +130,11 @@ class ResampledTransition(Transition):
         check_number("jitter", jitter, least=0)
         if jitter and scheme not in ("systematic", "soft"):
             raise ValueError(
-                f'jitter moves the copies apart that "systematic" and "soft" resampling make, 0 or more; got {jitter} '
+                f'jitter is for the copies of "systematic" and "soft" resampling, 0 or more; got {jitter} '
                 f"with {scheme!r}."
             )
         if past_key is not None and scheme == "transport":
-            raise ValueError('"transport" moves particles and picks none, so that they have no past of their own.')
+            raise ValueError('"transport" picks no particles, so that they have no past; leave past_key out.')
         (ensemble_key, *others), optional = reads(transition)
         others = [key for key in others if key != unravel_key(log_weight_key)]
         past = [] if past_key is None else [past_key]
@@ -152,13 +151,13 @@ class ResampledTransition(Transition):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Names one uniform number, where the scheme needs it; for a jitter normal ones, too."""
+        """Names the uniform number of schemes that need it, and normal numbers for a jitter."""
         if self.scheme not in ("systematic", "soft"):
             return ()
         return ("uniform", "normal") if self.jitter else ("",)
 
     def draw_noise(self, batch_size, *, members=None, state_dim=None, device=None, dtype=None, generator=None, **_):
-        """Draws uniform numbers ``[*batch_size, 1]``, and for a jitter normal ones ``[*batch_size, E, S]``."""
+        """Draws uniform numbers ``[*batch_size, 1]``, and for a jitter normal numbers ``[*batch_size, E, S]``."""
         if not self.noise_names:
             return None
         uniform = torch.rand((*batch_size, 1), device=device, dtype=dtype, generator=generator)
@@ -184,7 +183,7 @@ class ResampledTransition(Transition):
         past = self.required(entries, unravel_key(self.in_keys[2])) if self.has_past else None
         wanted = self._wanted(log_weights, entries.get(self.mask_key))
         noise = self._noise(entries, [particles, log_weights], call)
-        if past is not None:  # particles and their pasts are picked as one
+        if past is not None:  # particles and their pasts are picked together
             past = torch.cat([particles.unsqueeze(-2), past[..., :-1, :]], -2)
         moved, weights, picked = self._resample(particles, log_weights, past, noise)
         if wanted is not None:
@@ -242,11 +241,11 @@ class ResampledTransition(Transition):
 
 
 def _without_lost(forecast: torch.Tensor, log_weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Takes the weight of particles that the motion has thrown out of the numbers; the heaviest takes their place.
+    """Replaces particles that have diverged by the heaviest one, and sets their weights to zero.
 
-    Those are the ones whose cube would leave the precision: 7e12 in float32, 6e102 in float64. Infinity with no weight
-    would still be NaN in each sum, in the next step, and in every gradient. Where all particles are lost, the motion
-    has failed, and they stay as they are for the filter's checks to say.
+    A particle has diverged if its cube would overflow: beyond 7e12 in float32, 6e102 in float64. An infinite particle
+    of zero weight would still make NaN in each sum, in the next step, and in every gradient. If all particles diverged,
+    the motion has failed, and they are unchanged, for the filter's checks to report.
     """
     lost = ~(forecast.detach().abs() <= torch.finfo(forecast.dtype).max ** (1 / 3)).all(-1)
     lost = lost & ~lost.all(-1, keepdim=True)
@@ -257,21 +256,21 @@ def _without_lost(forecast: torch.Tensor, log_weights: torch.Tensor) -> tuple[to
 
 
 class ParticleAnalysis(Update):
-    r"""Bayes' rule on particles: :math:`w^i \propto w^i_{t|t-1}\, p(y_t | x^i)`; the particles stay where they are.
+    r"""Bayes' rule on particles: :math:`w^i \propto w^i_{t|t-1}\, p(y_t | x^i)`; the particles do not move.
 
-    Mean and variance are the weighted ones of all particles, before any resampling, which would only add to their
-    errors. Where nothing is observed the weights stay, exactly, and so they do where no particle can explain the
-    reading: the log-likelihood is then minus infinity.
+    Mean and variance are weighted, over all particles, before any resampling, which would only add to their errors.
+    If nothing is observed the weights are exactly unchanged; so are they if no particle can explain the reading, whose
+    log-likelihood is then minus infinity.
 
     Args:
-        likelihood: a Gaussian likelihood, of whose reading the innovation and its normalised square are written, too;
+        likelihood: a Gaussian likelihood, to also write the innovation of its reading and its normalised square;
             ``None`` for neither.
         tempering: power of the likelihood; below one the belief stays wider, as with an inflated ensemble.
-        space: in which the state lives; ``None`` for plain numbers.
+        space: space of the state; ``None`` for plain numbers.
         forecast_key: particles ``[*B, E, S]``.
         log_weight_key: their normalised log-weights ``[*B, E]``, see :class:`ResampledTransition`.
         log_likelihood_key: :math:`\log p(y | x^i)`, ``[*B, E]``, see :mod:`torch_denkf.modules.likelihood`.
-        belief_prefix: prefix of what is written: ``ensemble`` ``[*B, E, S]``, ``log_weight`` ``[*B, E]``, ``mean`` and
+        belief_prefix: prefix of the outputs: ``ensemble`` ``[*B, E, S]``, ``log_weight`` ``[*B, E]``, ``mean`` and
             ``var`` ``[*B, S]``.
         info_prefix: prefix of the diagnostics: the effective number of particles ``ess`` ``[*B, 1]``, after the update,
             and ``log_likelihood`` ``[*B, 1]``, :math:`\log \sum_i w^i_{t|t-1}\, p(y_t | x^i)`; with a ``likelihood``
@@ -324,8 +323,8 @@ class ParticleAnalysis(Update):
         """Returns the belief and the diagnostics."""
         joint = prior + self.tempering * log_likelihood
         total = torch.logsumexp(joint, -1, keepdim=True)
-        # The likelihood of nothing is one: without this, rounding would move weights that nothing has changed. Where no
-        # particle can explain the reading, in this precision, Bayes' rule is 0 / 0; the log-likelihood, -inf, tells.
+        # Without observations the likelihood is one: without this, rounding would change the weights. If no particle
+        # can explain the reading, in this precision, Bayes' rule is 0 / 0, and the log-likelihood is -inf.
         seen = (log_likelihood != 0).any(-1, keepdim=True) & (total != -math.inf)
         log_weights = torch.where(seen, joint - total, prior)
         return (

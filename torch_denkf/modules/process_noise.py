@@ -1,6 +1,6 @@
-r"""Noise with a full covariance: Q of a transition, or R of a sensor, through a Cholesky head.
+r"""Noise with a full covariance, as a learned Cholesky factor: Q of a transition, or R of a sensor.
 
-A filter with a covariance adds to its forecast what a *process noise* module writes under ``("forecast", "noise")``:
+A filter with a covariance adds to its forecast the output ``("forecast", "noise")`` of a *process noise* module:
 variances ``[*B, S]`` (:class:`~torch_denkf.modules.ConstantNoise` or :class:`~torch_denkf.modules.DiagonalNoise` with
 ``in_key=("belief", "mean"), out_key=("forecast", "noise")``) or a covariance ``[*B, S, S]`` (the modules of this file).
 """
@@ -38,12 +38,12 @@ def as_process_noise(
     size: int | None,
     name: str = "process_noise",
 ) -> TensorDictModuleBase:
-    """Returns a module that writes Q: the given one, or one of standard deviations ``[S]`` or one for all dimensions.
+    """Returns a module that writes Q: the given one, or a constant one for standard deviations ``[S]`` or one number.
 
     Args:
         noise: the module, or standard deviations in the state's units; 0 for a dimension without noise.
-        size: S, where it is known; needed where ``noise`` is one number.
-        name: of the argument, for messages.
+        size: S, if it is known; needed if ``noise`` is one number.
+        name: name of the argument, for messages.
 
     Raises:
         ValueError: if S is not known, or a standard deviation is negative.
@@ -63,13 +63,13 @@ def as_process_noise(
         raise ValueError(f"{name} must be {known}, a standard deviation for each; got {list(std.shape)}")
     if std.ndim == 0:
         if size is None:
-            raise ValueError(f"{name} is one number, and the initial belief does not say for how many: give [S].")
+            raise ValueError(f"{name} is one number, and the initial belief does not declare S: give [S].")
         std = std.expand(size)
     return ConstantNoise(std, in_key=_BELIEF_MEAN, out_key=_FORECAST_NOISE)
 
 
 class CholeskyNoise(SubModel):
-    r"""A learned covariance, constant or read off an entry: :math:`D L L^T D + C`, ``diag(r^2)`` before training.
+    r"""A learned covariance, constant or a function of an entry: :math:`D L L^T D + C`, ``diag(r^2)`` before training.
 
     :math:`D^2 = r^2 - c` and :math:`C` are diagonal, with the floor c; :math:`L` is lower triangular with a positive
     diagonal, the identity before training.
@@ -78,13 +78,13 @@ class CholeskyNoise(SubModel):
         dim: N, the size of the covariance.
         r: standard deviation before training, a number or one for each dimension, in the units of the state (or of
             the observation).
-        constant: the same covariance everywhere (then ``in_key`` gives its dtype alone), or one that depends on it.
+        constant: whether the covariance is constant, and only the dtype of ``in_key`` is used.
         floor: smallest variance c; 1 % of :math:`r^2` by default.
         num_cells: hidden layers of the network, if not ``constant``.
         in_features: size of the input; N by default.
         loc: mean of the input ``[in_features]``; zero by default.
-        scale: standard deviation of the input ``[in_features]``; one by default. An infinite one hides that feature
-            from the network: the position of a vehicle, say.
+        scale: standard deviation of the input ``[in_features]``; one by default. An infinite one removes that feature
+            from the network's input, such as the position of a vehicle.
         in_key: ``[*B, in_features]``, or learned observations ``[*B, E, in_features]``, whose mean is used.
         out_key: covariance ``[*B, N, N]``; ``("sensor", "noise")`` for R.
 
@@ -141,7 +141,7 @@ class CholeskyNoise(SubModel):
         else:
             raw = self.module((mean_of_members(features, batch_size) - self.loc) / self.scale)
         row, column = self.rows
-        # softplus grows like its input, so that a large output of a network does not blow the covariance up.
+        # softplus is linear for large inputs, so that a large output of a network does not blow up the covariance.
         positive = F.softplus(raw + 0.5413248546129181)  # log(e - 1): softplus of it is 1
         entries = torch.where(row == column, positive, raw) * self.std.to(raw.dtype)[row]
         factor = raw.new_zeros(*raw.shape[:-1], self.dim**2).index_copy(-1, row * self.dim + column, entries)
@@ -150,10 +150,10 @@ class CholeskyNoise(SubModel):
 
 
 class NoiseThrough(Wrapper):
-    """Runs another noise module and writes G Q G^T in its place, in the same entry; a sub-class gives G.
+    """Runs another noise module and replaces its output Q by G Q G^T; a sub-class implements G.
 
     Attributes:
-        noise_dim: N, of the noise inside, where it is known; an ensemble then draws no more.
+        noise_dim: N of the noise inside, if it is known; an ensemble then draws only N numbers.
     """
 
     place = "noise"
@@ -167,7 +167,7 @@ class NoiseThrough(Wrapper):
         return {**written, self.out_keys[0]: scaled @ matrix.mT}
 
     def unmapped(self, entries: Entries, call: Call) -> tuple[Entries, torch.Tensor]:
-        """Returns what the noise module inside writes, and G."""
+        """Returns the outputs of the noise module inside, and G."""
         written = self.run_inside(entries, call)
         noise = written[self.out_keys[0]]
         matrix = self._matrix(entries).to(noise.dtype)
@@ -184,11 +184,11 @@ class NoiseThrough(Wrapper):
 
 
 class MappedNoise(NoiseThrough):
-    r"""Noise that enters through a known matrix: :math:`G Q G^T`, e.g. some dimensions of the state alone.
+    r"""Noise that enters through a known matrix: :math:`G Q G^T`, e.g. in some dimensions of the state only.
 
     Args:
         noise: writes variances ``[*B, N]`` or a covariance ``[*B, N, N]``; its keys are kept.
-        matrix: G, ``[S, N]``; columns of the identity say which dimensions are noisy.
+        matrix: G, ``[S, N]``; columns of the identity select the noisy dimensions.
 
     Raises:
         ValueError: if the noise does not have N dimensions.

@@ -18,7 +18,7 @@ from torch_denkf.submodel import Sensor
 
 __all__ = ["ImageSensor", "VectorSensor", "convolutional_trunk"]
 
-#: Bytes of a trunk's results at a time, on a CPU: glibc keeps blocks of this size for the next chunk.
+#: Bytes of a trunk's activations at a time, on a CPU: glibc reuses blocks of this size for the next chunk.
 CPU_TRUNK_MEMORY = 32 * 2**20
 #: Table I: (channels, kernel, stride) of each convolution.
 PAPER_TRUNK = ((64, 7, 2), (32, 3, 2), (16, 3, 2))
@@ -43,7 +43,7 @@ def convolutional_trunk(in_channels: int, layers: Sequence[tuple[int, int, int]]
 
 
 class StochasticSensor(Sensor):
-    """A sensor whose noise is that of its head ``self.module["head"]``, a stochastic network."""
+    """A sensor with the noise of its head ``self.module["head"]``, a stochastic network."""
 
     ensemble_size: int
 
@@ -60,7 +60,7 @@ class StochasticSensor(Sensor):
 
 
 class _Sensor(StochasticSensor):
-    """A trunk that runs once a frame, and a stochastic head that runs for every member."""
+    """A trunk that runs once per frame, and a stochastic head that runs for every member."""
 
     def __init__(
         self,
@@ -89,10 +89,10 @@ class _Sensor(StochasticSensor):
         return measurement
 
     def _encode(self, measurement: torch.Tensor, seen: torch.Tensor | None) -> torch.Tensor:
-        """Returns features ``[N, F]`` of measurements ``[N, ...]``, of which ``seen`` ``[N, 1, ...]`` were observed."""
+        """Returns features ``[N, F]`` of measurements ``[N, ...]``; ``seen`` ``[N, 1, ...]`` marks those observed."""
         measurement = self._prepare(measurement)
         if seen is not None:
-            # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
+            # An unobserved frame may have NaN, which would reach the gradients even behind a mask.
             measurement = torch.where(seen, measurement, 0.0)
         return self.module["trunk"](measurement)
 
@@ -100,22 +100,22 @@ class _Sensor(StochasticSensor):
         return self._encode(measurement, seen)
 
     def compute(self, measurement, observed=None, *, noise):
-        """Returns the learned observations of every member, and the encoding if it is asked for."""
+        """Returns the learned observations of every member, and the encoding if it has a key."""
         batch_ndim = measurement.ndim - self.event_ndim
         batch_size, event_shape = measurement.shape[:batch_ndim], measurement.shape[batch_ndim:]
         seen = None if observed is None else observed.any(-1).reshape(-1, *(1,) * self.event_ndim)
-        # A trunk takes one batch dimension; the entries may have none or many.
+        # A trunk takes one batch dimension; the entries may have none or several.
         frames = measurement.reshape(batch_size.numel(), *event_shape)
         code = self._features(frames, seen)
         code = code.reshape(*batch_size, code.shape[-1])
-        # [*B, 1, F] against noise [*B, E, N]: what is equal for all members is computed once.
+        # [*B, 1, F] against noise [*B, E, N]: computations that are equal for all members run once.
         samples, hidden = self.module["head"](code.unsqueeze(-2), noise, sample=noise is not None, with_hidden=True)
         samples = (self.loc + self.scale * samples).expand(*batch_size, self.ensemble_size, self.observation_dim)
         return (samples, hidden.mean(-2)) if len(self.out_keys) > 1 else samples
 
 
 class ImageSensor(_Sensor):
-    """Table I's sensor: three convolutions once a frame, then stochastic layers for each ensemble member.
+    """Table I's sensor: three convolutions once per frame, then stochastic layers for each ensemble member.
 
     Args:
         observation_dim: O.
@@ -130,20 +130,20 @@ class ImageSensor(_Sensor):
         scale: standard deviation of the observation ``[O]``.
         pixel_loc: mean of each channel ``[C]``, after the division by 255 of uint8 images.
         pixel_scale: standard deviation of each channel ``[C]``; the trunk reads standardised pixels.
-        in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point in [0, 1]. Floating-point images that
-            seem to be in [0, 255] give a warning; the first that is not black is looked at.
+        in_key: images ``[*B, C, H, W]``, uint8 (divided by 255) or floating point in [0, 1]. Floating-point images
+            that seem to be in [0, 255] raise a warning; the first image that is not black is checked.
         out_key: learned observations ``[*B, E, O]``.
-        encoding_key: where to write the head's last hidden layer, averaged over the members, ``[*B, num_cells[-1]]``,
-            if anywhere.
-        trunk_memory: bytes that the trunk may take for what it computes on its way; frames beyond that follow in
-            further chunks. ``None``: 32 MiB on a CPU, where larger blocks go back to the system after each use, which
-            costs up to half of the time; no limit elsewhere, nor with a batch norm, which reads all frames of a chunk.
-            While gradients are recorded, all chunks stay in memory, unless ``recompute``.
-        recompute: activation checkpointing: what the trunk computes on its way is not kept for the backward pass
-            but computed again there, chunk by chunk, for a third more time.
+        encoding_key: key of the head's last hidden layer, averaged over the members, ``[*B, num_cells[-1]]``;
+            ``None`` to not write it.
+        trunk_memory: memory for the trunk's activations, in bytes; further frames are processed in further chunks.
+            ``None``: 32 MiB on a CPU, where larger blocks go back to the system after each use, which costs up to half
+            of the time; no limit elsewhere, nor with a batch norm, which couples all frames of a chunk. While
+            gradients are recorded, all chunks stay in memory, unless ``recompute``.
+        recompute: activation checkpointing: the trunk's activations are not stored for the backward pass but
+            recomputed there, chunk by chunk, for a third more time.
         trunk_dtype: precision of the trunk's layers, ``torch.bfloat16`` for half the memory, and on recent
             processors half the time; parameters and features keep theirs. ``None``: that of the parameters.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; frames of which nothing is observed are not read.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; frames without any observation are not read.
 
     Raises:
         ValueError: if an image does not have ``image_shape``, or ``trunk_memory`` is not positive.
@@ -183,7 +183,7 @@ class ImageSensor(_Sensor):
         if len(image_shape) != 3 or not all(isinstance(side, int) and side > 0 for side in image_shape):
             raise ValueError(f"image_shape is (channels, height, width), positive; got {image_shape!r}")
         trunk = convolutional_trunk(image_shape[0]) if trunk is None else trunk
-        # Twice as fast on a CPU, and nothing else changes. torch lacks this keyword among the overloads of Module.to.
+        # Twice as fast on a CPU, with equal results. torch lacks this keyword among the overloads of Module.to.
         trunk = trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         with torch.no_grad():
             features = trunk(torch.zeros(1, *image_shape)).shape[-1]
@@ -225,7 +225,7 @@ class ImageSensor(_Sensor):
             measurement = measurement.to(self.loc.dtype) / 255
             return (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
         measurement = (measurement - self.pixel_loc) / self.pixel_scale if self.standardise else measurement
-        if not torch.compiler.is_compiling() and not self._looked:  # in this order: no compiled code depends on it
+        if not torch.compiler.is_compiling() and not self._looked:  # this order keeps it out of compiled code
             self._looked = diagnosis().look_at_brightness(self.in_keys[0], measurement)
         return measurement
 
@@ -244,7 +244,7 @@ class VectorSensor(_Sensor):
         scale: standard deviation of the observation ``[O]``.
         in_key: measurements ``[*B, in_features]``.
         out_key: learned observations ``[*B, E, O]``.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; rows of which nothing is observed are not read.
+        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]``; rows without any observation are not read.
 
     Example:
         >>> from tensordict import TensorDict

@@ -1,4 +1,4 @@
-"""Beliefs and readings on a space: as tangents at a mean, where they are plain numbers."""
+"""Conversions of beliefs and readings on a space to tangents at a mean, which are plain numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def narrowed_mask(space: Space | None, observed: Tensor | None) -> Tensor | None
 
 
 def mean_reading(space: Space | None, samples: Tensor, observed: Tensor | None) -> Tensor:
-    """Returns the mean ``[*B, Q]`` of samples of a reading ``[*B, E, Q]``; neutral where a mask hides them."""
+    """Returns the mean ``[*B, Q]`` of samples of a reading ``[*B, E, Q]``; neutral where a mask marks them missing."""
     if space is None:
         return samples.mean(-2)
     if observed is not None:
@@ -25,9 +25,10 @@ def mean_reading(space: Space | None, samples: Tensor, observed: Tensor | None) 
 
 
 def mean_and_tangents(space: Space, ensemble: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the mean ``[*B, P]`` of members and the tangents ``[*B, E, D]`` to them, by two steps from nearby.
+    """Returns the mean ``[*B, P]`` of members and the tangents ``[*B, E, D]`` to them, by two iterations.
 
-    For members that an update has just placed about ``start`` ``[*B, P]``; wide ones need more, see :meth:`Space.mean`.
+    ``start`` ``[*B, P]`` is a point near the mean, as after an update; members that are spread widely need more
+    iterations, see :meth:`Space.mean`.
     """
     mean = start
     for _ in range(2):

@@ -1,15 +1,15 @@
 r"""Stochastic layers (the paper's SNN) and the network built from them.
 
-Two kinds, with the same interface:
+There are two kinds, with the same interface:
 
 * **MC dropout** (Gal & Ghahramani 2016, the paper's section III-A): each hidden unit is dropped with
-  probability ``rate``, also at test time. Masks differ between members, so each member sees its own network.
+  probability ``rate``, also at test time. Masks differ between members, so each member has its own network.
 * **Flipout** (Wen et al. 2018, the authors' code): weights :math:`W \sim N(\mu, \sigma^2)`; one perturbation
-  :math:`\Delta W = \sigma \circ \varepsilon` a call is decorrelated between rows by random signs,
+  :math:`\Delta W = \sigma \circ \varepsilon` per call is decorrelated between rows by random signs,
   :math:`y_i = x_i \mu^T + ((x_i \circ s_i) \Delta W^T) \circ r_i`.
 
-Whether a layer samples never depends on ``.training`` (torchrl puts transforms in eval mode): ``sample=False``
-gives the deterministic forward, the mean network.
+Sampling never depends on ``.training`` (torchrl puts transforms in eval mode): ``sample=False`` gives the
+deterministic forward, the mean network.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from torch_denkf.functional.kernels.random_bits import (
 __all__ = ["FlipoutLinear", "StochasticMLP", "deterministic"]
 
 
-#: Replaces linear layers, where the steps of a sequence share their gradients.
+#: Replacement of linear layers for sequences, whose steps share their gradients.
 LAYERS: list[Callable] = []
 
 
@@ -48,7 +48,7 @@ class FlipoutLinear(nn.Module):
         in_features: size of the input.
         out_features: size of the output.
         posterior_std: initial standard deviation of every weight.
-        prior_std: standard deviation of the zero-mean Gaussian prior that :meth:`kl` measures against.
+        prior_std: standard deviation of the zero-mean Gaussian prior in :meth:`kl`.
 
     Shapes:
         input ``[*, in_features]``, output ``[*, out_features]``; ``signs`` bool ``[*, in_features + out_features]``;
@@ -85,7 +85,7 @@ class FlipoutLinear(nn.Module):
         return self.weight.numel() + self.bias.numel()
 
     def forward(self, x: torch.Tensor, signs=None, perturbation=None, *, sample: bool = True) -> torch.Tensor:
-        """Applies the layer; noise that is not given is drawn. ``sample=False`` uses the mean weights."""
+        """Applies the layer; missing noise is drawn. ``sample=False`` uses the mean weights."""
         mean = F.linear(x, self.weight, self.bias)
         if not sample:
             return mean
@@ -120,17 +120,18 @@ class StochasticMLP(nn.Module):
         num_cells: width of each hidden layer; Table I's transition has (32, 32, 64, 64).
         layer: ``"dropout"`` (after each hidden activation, also in evaluation mode), ``"flipout"`` or ``"none"``
             (deterministic, the paper's ``fc``).
-        rate: probability of dropping a hidden unit (``"dropout"``), rounded to a multiple of 1/256.
+        rate: drop probability of a hidden unit (``"dropout"``), rounded to a multiple of 1/256.
         posterior_std: initial standard deviation of the weights (``"flipout"``).
         activation: the non-linearity of hidden layers, ReLU by default.
-        output_gain: factor on the last layer's initial weights; a small one starts a residual model near the
-            identity, zero starts it there.
+        output_gain: factor of the last layer's initial weights; with a small one a residual model starts near the
+            identity, with zero it is the identity.
         masks: ``"balanced"`` drops each unit in the same share of an ensemble's members, drawn without replacement
-            (``"dropout"``): their mean is then nearer to that of infinitely many. ``"random"`` draws independently.
+            (``"dropout"``): the ensemble's mean is then nearer to that of infinitely many members. ``"random"`` draws
+            independently.
 
     Shapes:
         input ``[*, in_features]``, output ``[*, out_features]``. Noise: for dropout, uint8 random bytes
-        ``[*, noise_size]``, units are kept where they are at least ``256 * rate``, or a boolean mask of the units to
+        ``[*, noise_size]``, of which values of at least ``256 * rate`` keep a unit, or a boolean mask of the units to
         keep; for flipout, a dictionary of ``signs`` bool ``[*, noise_size]`` and ``perturbation`` ``[P]``, one draw for
         all rows, or ``[*B, P]`` with ``x`` ``[*B, E, in_features]``.
 
@@ -164,7 +165,7 @@ class StochasticMLP(nn.Module):
         for name, size in (("in_features", in_features), ("out_features", out_features)):
             check_count(name, size)
         for size in num_cells:
-            check_count("num_cells", size, cure=f"It holds the widths of the hidden layers: {list(num_cells)}")
+            check_count("num_cells", size, cure=f"These are the widths of the hidden layers: {list(num_cells)}")
         check_number("output_gain", output_gain)
         self.layer, self.rate, self.balanced = layer, representable_rate(rate), masks == "balanced"
         self.sample = True
@@ -188,12 +189,12 @@ class StochasticMLP(nn.Module):
             self.noise_splits = [n_in + n_out for n_in, n_out in pairwise(sizes)]
         else:
             self.noise_splits = []
-        #: Random bytes (dropout) or signs (flipout) that one row of the input needs.
+        #: Number of random bytes (dropout) or signs (flipout) for one row of the input.
         self.noise_size = sum(self.noise_splits)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Names the tensors that one call needs, see :class:`torch_denkf.modules.SubModel`."""
+        """Names the noise tensors of one call, see :class:`torch_denkf.modules.SubModel`."""
         if not self.noise_size or not self.sample:
             return ()
         return ("",) if self.layer == "dropout" else ("signs", "perturbation")
@@ -207,9 +208,9 @@ class StochasticMLP(nn.Module):
             batch_size: batch dimensions (the tensordict's).
             members: event dimensions in front of the features, usually the ensemble size.
             time: whether the last of ``batch_size`` is time. All rows of one time share flipout's perturbation of the
-                weights; another time has another, as if the sequence were taken step by step.
-            device: where to draw.
-            dtype: of the flipout perturbation.
+                weights; different times have different ones, as if the sequence ran step by step.
+            device: device of the noise.
+            dtype: dtype of the flipout perturbation.
             generator: source of randomness; torch's global one by default.
 
         Returns:
@@ -226,11 +227,11 @@ class StochasticMLP(nn.Module):
         times = batch_size[-1:] if time else ()
         perturbation = torch.randn((*times, size), device=device, dtype=dtype, generator=generator)
         signs = random_signs(rows, device=device, generator=generator)
-        # Expanded dimensions take no memory.
+        # Expanded dimensions need no memory.
         return {"signs": signs, "perturbation": perturbation.expand(*batch_size, size)}
 
     def forward(self, x: torch.Tensor, noise=None, *, sample: bool | None = None, with_hidden: bool = False):
-        """Maps ``x`` ``[*, in_features]`` to ``[*, out_features]``; noise that is not given is drawn.
+        """Maps ``x`` ``[*, in_features]`` to ``[*, out_features]``; missing noise is drawn.
 
         Args:
             x: the input.
@@ -266,14 +267,14 @@ class StochasticMLP(nn.Module):
     def jacobian(self, x: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Returns the mean network's output and its Jacobian by the first ``size`` inputs, ``[*, out_features, size]``.
 
-        ``None`` where the activation's derivative is not known, see
+        It is ``None`` if the activation's derivative is not known, see
         :func:`~torch_denkf.functional.jacobians.jacobian_of_network`.
         """
         layers = [part for layer in self.layers for part in (layer, self.activation)][:-1]
         return jacobian_of_layers(layers, x, size, (nn.Linear, FlipoutLinear))
 
     def _perturbation_sizes(self) -> list[int]:
-        """Numbers of perturbed weights and biases; those of flipout's layers."""
+        """Returns the number of perturbed weights and biases of each flipout layer."""
         return [layer.perturbation_size for layer in self.layers if isinstance(layer, FlipoutLinear)]
 
     def _flipout(self, noise: Mapping[str, torch.Tensor]) -> list[tuple[Callable[..., torch.Tensor], None]]:
@@ -291,13 +292,13 @@ class StochasticMLP(nn.Module):
         ]
 
     def kl(self) -> torch.Tensor:
-        """Returns the KL divergence of the weights from their prior, in nats; zero where the layers have none."""
+        """Returns the KL divergence of the weights from their prior, in nats; zero for layers without a prior."""
         zero = next(self.layers.parameters()).new_zeros(())
         return sum((layer.kl() for layer in self.layers if isinstance(layer, FlipoutLinear)), zero)
 
 
 class deterministic:
-    """Context manager: every :class:`StochasticMLP` inside ``module`` runs its deterministic forward.
+    """Context manager in which every :class:`StochasticMLP` inside ``module`` runs its deterministic forward.
 
     Example:
         >>> net = StochasticMLP(5, 2)

@@ -1,4 +1,4 @@
-"""Constants of sub-models: numbers, lists and arrays become tensors of torch's default precision."""
+"""Constants of sub-models: converts numbers, lists and arrays to tensors of torch's default precision."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ __all__ = [
 
 
 def as_floating(value: Any, name: str = "the constant") -> Tensor:
-    """Copies a value to a floating tensor: a tensor keeps its dtype, everything else gets torch's default one.
+    """Copies a value to a floating-point tensor; a floating tensor keeps its dtype, other values get torch's default.
 
     Raises:
-        TypeError: if it is neither a tensor nor numbers, or complex; ``name`` is the argument's.
-        ValueError: if it asks for a gradient, which would get lost.
+        TypeError: if it is neither a tensor nor numbers, or complex; the message has ``name``.
+        ValueError: if it requires a gradient, which would be lost.
 
     Example:
         >>> as_floating([1, 2]).dtype, as_floating(torch.ones(2, dtype=torch.float64)).dtype
@@ -51,7 +51,7 @@ def as_floating(value: Any, name: str = "the constant") -> Tensor:
 def register_constant(
     module: nn.Module, name: str, value: Tensor | Sequence | float | None, *, trainable: bool = False
 ) -> None:
-    """Keeps a constant in a module as a buffer, or as a parameter; ``None`` stays ``None``."""
+    """Registers a constant of a module as a buffer, or as a parameter; ``None`` stays ``None``."""
     given = value.detach() if trainable and isinstance(value, Tensor) else value
     tensor = None if value is None else as_floating(given, name)
     if trainable and tensor is not None:
@@ -63,7 +63,7 @@ def register_constant(
 def register_matrix(
     module: nn.Module, name: str, value: Tensor | Sequence | None, layout: str, *, trainable: bool = False
 ) -> None:
-    """Keeps a matrix of finite numbers in a module, as a buffer or as a parameter.
+    """Registers a matrix of finite numbers in a module, as a buffer or as a parameter.
 
     Raises:
         ValueError: if it is no matrix, or one of its numbers is not finite.
@@ -76,31 +76,31 @@ def register_matrix(
 
 
 def check_untrained(name: str, value: Any, why: str) -> None:
-    """Raises where what is kept as a constant asks for a gradient: it would be accepted and never trained.
+    """Raises if a constant requires a gradient, because it would never be trained.
 
     Raises:
-        ValueError: if it does; ``name`` is the argument's.
+        ValueError: if it does; the message has ``name``, the argument's name.
     """
     if isinstance(value, Tensor) and value.requires_grad:
         raise ValueError(
-            f"{name} asks for a gradient and would never be trained: {why}. Detach it, and choose it on validation "
-            "data; or take trainable=True, or a module that learns it, where there is one"
+            f"{name} requires a gradient but would never be trained: {why}. Detach it, and choose it on validation "
+            "data; or use trainable=True, or a module that learns it, if there is one"
         )
 
 
 def register_location_and_scale(
     module: nn.Module, loc: Tensor | Sequence | float | None, scale: Tensor | Sequence | float | None, prefix: str = ""
 ) -> None:
-    """Keeps the mean and the standard deviation that standardise inputs, each a buffer, or ``None``.
+    """Registers the mean and the standard deviation that standardise inputs, each a buffer, or ``None``.
 
     Args:
-        module: that keeps them.
+        module: module to register them in.
         loc: finite numbers.
-        scale: positive numbers; an infinite one hides its input.
-        prefix: of the names of the buffers, ``"loc"`` and ``"scale"``.
+        scale: positive numbers; an infinite one removes its input.
+        prefix: prefix of the buffers' names, ``"loc"`` and ``"scale"``.
 
     Raises:
-        ValueError: if a number is not of these.
+        ValueError: if a number is invalid.
     """
     for name, value, above in (("loc", loc, None), ("scale", scale, 0)):
         register_constant(module, prefix + name, value)
@@ -109,24 +109,24 @@ def register_location_and_scale(
 
 
 def as_standard_deviations(name: str, value: Any) -> Tensor:
-    """Returns standard deviations ``[N]``, zero where there is none.
+    """Returns standard deviations ``[N]``.
 
     Raises:
         ValueError: if they have another shape, or one is negative or not finite.
     """
     std = as_floating(value, name)
     if std.ndim != 1:
-        raise ValueError(f"{name} must be [N], one standard deviation a dimension; got {list(std.shape)}")
+        raise ValueError(f"{name} must be [N], one standard deviation per dimension; got {list(std.shape)}")
     check_values(f"{name}, a standard deviation,", std, least=0)
     return std
 
 
 def as_vector(name: str, value: Any, size: int, *, above: float | None = None) -> Tensor:
-    """Returns finite numbers ``[size]``, of one number for all or one for each.
+    """Returns finite numbers ``[size]``, from one number for all or one for each.
 
     Raises:
         TypeError: if they are no numbers.
-        ValueError: if they are neither one nor ``size``, not finite, or not above a limit.
+        ValueError: if there are neither one nor ``size`` of them, or one is not finite or not above the limit.
     """
     vector = as_floating(value, name)
     if vector.ndim > 1 or vector.numel() not in (1, size):
@@ -136,15 +136,15 @@ def as_vector(name: str, value: Any, size: int, *, above: float | None = None) -
 
 
 def check_dims(name: str, dims: Sequence[int], size: int | None = None, *, once: bool = False) -> None:
-    """Raises unless these are indices of components, of ``size`` of them where that is known.
+    """Raises unless these are indices of components, below ``size`` if that is known.
 
     Raises:
         TypeError: if one is no whole number.
-        ValueError: if one is negative or too large, or there twice although each may be there ``once``.
+        ValueError: if one is negative or too large, or occurs twice although each may occur only ``once``.
     """
     for index in dims:
         if isinstance(index, bool) or not hasattr(index, "__index__"):
-            raise TypeError(f"{name} holds indices of components, whole numbers; got {index!r} in {list(dims)}")
+            raise TypeError(f"{name} must be indices of components, whole numbers; got {index!r} in {list(dims)}")
         check_number(name, int(index), least=0, below=size, cure=f"The indices are {list(dims)}")
     if once and len(set(dims)) < len(dims):
         raise ValueError(f"{name} names each component once; got {list(dims)}")
@@ -153,19 +153,19 @@ def check_dims(name: str, dims: Sequence[int], size: int | None = None, *, once:
 def variance_and_floor(
     owner: str, size: int, r: Tensor | Sequence[float] | float, floor: Tensor | Sequence[float] | float | None
 ) -> tuple[Tensor, Tensor]:
-    """Splits variances before training into what is above the floor, :math:`r^2 - c`, and the floor c, both ``[size]``.
+    """Splits initial variances into the part above the floor, :math:`r^2 - c`, and the floor c, both ``[size]``.
 
     Args:
-        owner: who asks, for the message.
-        size: dimensions.
-        r: standard deviation before training, a number or one for each dimension.
+        owner: name of the module, for the message.
+        size: number of dimensions.
+        r: standard deviation before training, one number or one for each dimension.
         floor: smallest variance c; 1 % of :math:`r^2` by default.
 
     Raises:
         ValueError: if ``r`` is not positive or the floor reaches :math:`r^2`.
     """
     variance = as_vector(f"r of {owner}", r, size, above=0) ** 2
-    check_values(f"r^2 of {owner}", variance, above=0, cure="Scale the observation, so that its variance is a number")
+    check_values(f"r^2 of {owner}", variance, above=0, cure="Scale the observation, so that r^2 is finite and positive")
     floor = 0.01 * variance if floor is None else as_vector(f"floor of {owner}", floor, size)
     check_values(f"floor of {owner}", floor, least=0)
     check_values(f"r^2 - floor of {owner}", variance - floor, above=0, cure="The floor is a variance below r^2")
@@ -173,19 +173,19 @@ def variance_and_floor(
 
 
 def mask_of(observed_key: NestedKey, out_key: NestedKey) -> dict[NestedKey, NestedKey]:
-    """Maps a mask that a module derives to the mask that it derives it from, unravelled.
+    """Maps a mask that a module derives to the mask from which it is derived, unravelled.
 
     Raises:
-        ValueError: if both have one key: what a step wrote would be taken for what was observed in the next.
+        ValueError: if both have the same key: the output of a step would be the observed mask of the next.
     """
     given, made = unravel_key(observed_key), unravel_key(out_key)
     if given == made:
         raise ValueError(
-            f"out_key must differ from observed_key, {observed_key!r}: one black picture would hide all that follow"
+            f"out_key must differ from observed_key, {observed_key!r}: else one black image would mask all later ones"
         )
     return {made: given}
 
 
 def mean_of_members(value: Tensor, batch_size: Sequence[int]) -> Tensor:
-    """Returns the mean of ``[*B, E, N]`` over the members; ``[*B, N]`` as it is."""
+    """Returns the mean of ``[*B, E, N]`` over the members; ``[*B, N]`` unchanged."""
     return value.mean(-2) if value.ndim > len(batch_size) + 1 else value

@@ -43,21 +43,21 @@ class MemberNetwork(SubModel):
 class LearnedTransition(MemberNetwork, Transition):
     r"""A learned transition, residual by default: :math:`x_t = x_{t-1} + s \circ f_\theta((x_{t-1} - m) / s, a)`.
 
-    Commands in degrees, or in ticks of an encoder, are far from what a network likes to read: give their mean and
-    standard deviation, and it reads :math:`(a - m_a) / s_a`.
+    For commands with values far from one, such as degrees or encoder ticks, give their mean and standard deviation:
+    the network then reads :math:`(a - m_a) / s_a`.
 
     Args:
-        network: maps ``[*, S]`` (or ``[*, S + A]`` with an action) to ``[*, S]``; a :class:`StochasticMLP` makes
-            the process noise.
+        network: maps ``[*, S]`` (or ``[*, S + A]`` with an action) to ``[*, S]``; a :class:`StochasticMLP` adds
+            process noise.
         residual: adds the input state to the output.
         loc: mean :math:`m` of each state dimension, ``[S]``, in the state's units.
         scale: standard deviation :math:`s` of each state dimension, ``[S]``; the network works in these units.
-        action_key: entry ``[*B, A]`` that drives the transition *into* the new state, i.e. the action taken at
+        action_key: entry ``[*B, A]`` of the action that leads *into* the new state, i.e. the action taken at
             the previous step; ``None`` for none.
         action_loc: mean of each command ``[A]``, in its units; zero by default.
         action_scale: standard deviation of each command ``[A]``; one by default.
-        dt_key: entry ``[*B, 1]`` with the seconds since the last step, where steps differ in length: the network then
-            writes the rate of change per second, which is multiplied by it (Euler's step); only if ``residual``.
+        dt_key: entry ``[*B, 1]`` with the seconds since the last step, for steps of different length: the network
+            then computes the rate of change per second, which is multiplied by it (Euler's step); needs ``residual``.
         in_key: the belief's ensemble ``[*B, E, S]``.
         out_key: the forecast ensemble ``[*B, E, S]``.
 
@@ -89,7 +89,7 @@ class LearnedTransition(MemberNetwork, Transition):
         out_key: NestedKey = ("forecast", "ensemble"),
     ):
         if dt_key is not None and not residual:
-            raise ValueError(f"dt_key={dt_key!r} scales a change: it needs residual=True.")
+            raise ValueError(f"dt_key={dt_key!r} scales a change, and needs residual=True.")
         super().__init__(network, [in_key, *(key for key in (action_key, dt_key) if key is not None)], [out_key])
         self.residual, self.action_key, self.dt_key = residual, action_key, dt_key
         register_location_and_scale(self, loc, scale)
@@ -100,7 +100,7 @@ class LearnedTransition(MemberNetwork, Transition):
         return self._moved(state, self._run(self.features(state, action), noise), action, dt)
 
     def features(self, state: torch.Tensor, action: Any) -> torch.Tensor:
-        """Returns what the network reads, ``[*B, E, S]`` or ``[*B, E, S + A]``, of states and an action."""
+        """Returns the network's inputs, ``[*B, E, S]`` or ``[*B, E, S + A]``, from states and an action."""
         features = state if self.loc is None else state - self.loc
         features = features if self.scale is None else features / self.scale
         if self.action_key is None:
@@ -125,7 +125,7 @@ class LearnedTransition(MemberNetwork, Transition):
     def _moved(self, state, change, action, dt):
         if self.scale is not None:
             change = change * self.scale
-        if self.dt_key is not None:  # without an action it is read second
+        if self.dt_key is not None:  # without an action, dt is the second input
             change = change * (action if dt is None else dt).to(change.dtype).unsqueeze(-2)
         if self.residual:
             return state + change

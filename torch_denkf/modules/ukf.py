@@ -1,4 +1,4 @@
-"""The unscented Kalman filter's two steps: sigma points are ensembles, and go through the same modules."""
+"""The unscented Kalman filter's two steps, which pass sigma points as ensembles through the same modules."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class _SigmaPoints:
 
 
 class UKFTransition(_SigmaPoints, GaussianTransition):
-    r"""Forecast of mean and covariance from sigma points that go through a transition as an ensemble of 2 S + 1.
+    r"""Forecast of mean and covariance: 2 S + 1 sigma points pass through the transition as an ensemble.
 
-    The transition's stochastic networks run their deterministic forward. One that mixes its members, as a
-    network without drift does that subtracts their mean, mixes the sigma points.
+    The transition's stochastic networks run their deterministic forward. A network that couples its members, for
+    example by subtracting their mean, couples the sigma points.
 
     Args:
         transition: forecasts ensembles ``[*B, E, S]``.
@@ -53,11 +53,11 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
             :mod:`torch_denkf.modules.process_noise`.
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
-        kappa: their secondary spread.
+        kappa: second scaling parameter of the spread.
         **keys: see :class:`GaussianTransitionKeys`. The covariance of the last analysis may be singular.
 
     Raises:
-        ValueError: if the transition holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
+        ValueError: if the transition has random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -99,17 +99,17 @@ class UKFTransition(_SigmaPoints, GaussianTransition):
 
 
 class UKFAnalysis(_SigmaPoints, GaussianAnalysis):
-    """The update of mean and covariance by fresh sigma points of the forecast, through an observation model.
+    """The update of mean and covariance: new sigma points of the forecast pass through an observation model.
 
     Args:
         observation: observes ensembles ``[*B, E, S]``.
         alpha: spread of the sigma points.
         beta: extra weight of the central point in the covariance.
-        kappa: their secondary spread.
+        kappa: second scaling parameter of the spread.
         **options: see :class:`GaussianAnalysisOptions`.
 
     Raises:
-        ValueError: if the model holds random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
+        ValueError: if the model has random layers outside a :class:`~torch_denkf.modules.StochasticMLP`.
         KeyError: if an entry is missing.
 
     Example:

@@ -1,4 +1,4 @@
-"""A ceiling on the variances of a belief, so that a system that nobody observes stays finite."""
+"""A ceiling on the variances of a belief, which keeps unobserved unstable systems finite."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["VarianceCeiling"]
 
 
 class VarianceCeiling(SubModel):
-    """Clamps the variances of a belief to a ceiling; correlations stay.
+    """Clamps the variances of a belief to a ceiling; correlations are kept.
 
-    It is the last module of a filter's update. An ensemble moves as a whole; of weighted particles only those move
-    that make the variance too large.
+    It is the last module of a filter's update. An ensemble is scaled as a whole; of weighted particles only those are
+    moved that make the variance too large.
 
     Args:
-        kinds: of the belief, see :func:`torch_denkf.beliefs.kinds_of`.
-        keys: of the belief, as far as a step writes them.
+        kinds: kinds of the belief, see :func:`torch_denkf.beliefs.kinds_of`.
+        keys: keys of the belief that a step writes.
         ceiling: largest variance, in the state's units squared.
 
     Attributes:
-        reached: whether variances were clamped, as far as that was looked at; for warnings.
+        reached: whether variances were clamped, if that was checked; for warnings.
 
     Raises:
-        ValueError: if ``ceiling`` is not positive, or a kind of belief does not say how it is limited.
+        ValueError: if ``ceiling`` is not positive, or a kind of belief has no ``limited`` for its carried entries.
 
     Example:
         >>> import torch
@@ -48,19 +48,19 @@ class VarianceCeiling(SubModel):
         for kind in kinds:
             if kind.carried and {*kind.carried}.isdisjoint(("mean", "cov")) and type(kind).limited is Belief.limited:
                 raise ValueError(
-                    f"{type(kind).__name__} carries {list(kind.carried)}, which a ceiling of the variances does not "
-                    "reach: write its limited(), or give the filter variance_ceiling=None."
+                    f"{type(kind).__name__} carries {list(kind.carried)}, to which a ceiling of the variances does not "
+                    "apply: implement its limited(), or give the filter variance_ceiling=None."
                 )
         self.ceiling = ceiling
         self.kinds = [(kind.key("var"), kind) for kind in kinds if {kind.key("mean"), kind.key("var")} <= {*keys}]
         self.reached = False
 
     def on_entries(self, entries, call):
-        """Returns the entries that change."""
+        """Returns the changed entries."""
         out = {}
         for key, kind in self.kinds:
             variance = entries.get(key)
-            # Whether anything is to be clamped is not looked at where that would wait for a device.
+            # On a GPU the comparison is not read, because that would wait for the device.
             above = None if variance is None or on_gpu(variance) else flag_value((variance > self.ceiling).any())
             if variance is None or above is False:
                 continue

@@ -1,4 +1,4 @@
-"""Tables that map what was measured on clean data to the distribution that theory has for it."""
+"""Calibration tables that map statistics of clean data to their theoretical distribution."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch_denkf.monitoring.chi_square import chi_square_quantile
 __all__ = ["IDENTITY", "check_observation_dim", "chi_square_table", "empirical_quantile", "score_table", "sign_limits"]
 
 _LEVELS = (0.01, *(0.05 * n for n in range(1, 20)), 0.975, 0.99, 0.995, 0.998, 0.999, 0.9995, 0.9999)
-#: Knots and heights ``[2, N]`` of the map that changes nothing.
+#: Knots and heights ``[2, N]`` of the identity map.
 IDENTITY = torch.arange(len(_LEVELS) + 2.0).repeat(2, 1)
 
 
 def check_observation_dim(expected: int, innovation: Tensor, name: str) -> None:
-    """Raises unless the innovations ``[*B, O]`` have the number of components that ``name`` was given.
+    """Checks that the innovations ``[*B, O]`` have the expected number of components.
 
     Raises:
-        ValueError: if they have not.
+        ValueError: if they have another number; ``name`` is for the message.
     """
     if innovation.shape[-1] != expected:
         raise ValueError(
@@ -33,7 +33,7 @@ def empirical_quantile(values: Tensor, levels: Tensor) -> Tensor:
 
 
 def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
-    """Returns knots and heights ``[2, N]`` from ``nis`` ``[M]`` of clean data to chi-square; linear beyond."""
+    """Returns knots and heights ``[2, N]`` that map ``nis`` ``[M]`` of clean data to chi-square; linear beyond."""
     levels = _levels(len(nis))
     measured = _rising(empirical_quantile(nis, levels).clamp_min(1e-9))
     expected = torch.tensor([chi_square_quantile(1 - level, freedom) for level in levels.tolist()])
@@ -44,7 +44,7 @@ def chi_square_table(nis: Tensor, freedom: int) -> Tensor:
 def score_table(values: Tensor) -> Tensor:
     """Returns knots and heights ``[2, N]`` that map ``values`` ``[M]`` of clean data to standard normal scores.
 
-    Beyond the largest a standard deviation of the data is a score of one.
+    Beyond the data, one standard deviation of them is a score of one.
     """
     levels, spread = _levels(len(values)), values.std().clamp_min(1e-6)
     measured = _rising(empirical_quantile(values, levels))
@@ -54,9 +54,9 @@ def score_table(values: Tensor) -> Tensor:
 
 
 def sign_limits(values: Tensor, rate: float, floor: Tensor, margin: float) -> Tensor:
-    """Limits ``[K]`` that signs ``[M, K]`` of clean data exceed in a share ``rate`` of the rows at most, all together.
+    """Returns limits ``[K]`` that any of the signs ``[M, K]`` exceeds in at most a share ``rate`` of clean rows.
 
-    Each is ``margin`` times a quantile, and ``floor`` ``[K]`` at least. NaN is left out.
+    Each limit is ``margin`` times a quantile, at least ``floor`` ``[K]``. NaN is left out.
     """
     level = torch.tensor([1 - rate / values.shape[-1]], dtype=torch.float64)
     limits = []
@@ -73,6 +73,6 @@ def _levels(count: int) -> Tensor:
 
 
 def _rising(values: Tensor) -> Tensor:
-    """Separates equal values by steps that float32 can tell."""
+    """Separates equal values by steps that float32 resolves."""
     step = 1e-5 * values.abs().max().clamp_min(1e-9)
     return values.cummax(0).values + step * torch.arange(len(values))

@@ -1,4 +1,4 @@
-"""A camera that shows nothing says itself that it fails."""
+"""Masks images that are entirely black."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ __all__ = ["BlackIsMissing"]
 
 
 class BlackIsMissing(Sensor):
-    """Marks pictures that are black all over as not observed: no scene is.
+    """Marks images that are entirely black as not observed.
 
-    A sensor reads something in a black picture, too, and a filter uses it. Put this module in front of the sensor,
-    ``TensorDictSequential(BlackIsMissing(), sensor)``, and let the filter read its mask, ``observed_key="seen"``. The
-    filter then goes by its motion until the camera is back, and its spread grows.
+    A network outputs a reading for a black image, too, and the filter would use it. Put this module in front of the
+    sensor, ``TensorDictSequential(BlackIsMissing(), sensor)``, and let the filter read its mask,
+    ``observed_key="seen"``. The filter then only predicts until the camera is back, and its spread grows.
 
     Args:
-        threshold: a picture none of whose pixels is brighter, as a share of white, is black.
-        image_key: pictures ``[*B, C, H, W]``, in [0, 1] or of whole numbers up to 255.
-        observed_key: optional mask ``[*B, 1]`` of pictures that were missing before.
-        out_key: the mask ``[*B, 1]``: False where a picture is black, and where it was missing before.
+        threshold: an image is black if no pixel is brighter than this share of white.
+        image_key: images ``[*B, C, H, W]``, in [0, 1] or integers up to 255.
+        observed_key: optional observed mask ``[*B, 1]`` of the images.
+        out_key: the mask ``[*B, 1]``: False where an image is black, or ``observed_key`` is False.
 
     Raises:
         ValueError: if the threshold is not between 0 and 1, or both masks have one key.

@@ -1,4 +1,4 @@
-"""The chi-square distribution of normalised innovations: p-values, quantiles, and what a bias does to them."""
+"""Chi-square distribution of normalised innovations squared: p-values, quantiles, and detectable biases."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ def chi_square_p_value(value: Tensor, freedom: float | Tensor) -> Tensor:
 
     Args:
         value: not negative, any shape: for example a normalised innovation squared.
-        freedom: degrees of freedom, broadcasts with ``value``. Where they are 0 nothing was seen, and the probability
-            is 1.
+        freedom: degrees of freedom, broadcasts with ``value``. With 0, nothing was observed, and the probability is 1.
 
     Returns:
         ``[*]`` in [0, 1], differentiable by ``value``.
@@ -29,9 +28,9 @@ def chi_square_p_value(value: Tensor, freedom: float | Tensor) -> Tensor:
         tensor([0.0500, 1.0000])
     """
     freedom = freedom if isinstance(freedom, Tensor) else value.new_full((), freedom)
-    freedom = freedom.to(value).detach()  # torch has no derivative by it
+    freedom = freedom.to(value).detach()  # torch has no derivative with respect to it
     seen = freedom > 0
-    # Replaced before the function is called, so that neither its value nor its gradient is NaN there.
+    # Unobserved rows get valid arguments, so that neither value nor gradient is NaN.
     tail = torch.special.gammaincc(torch.where(seen, freedom, 1) / 2, torch.where(seen, value, 1).clamp_min(1e-30) / 2)
     return torch.where(seen, tail, 1)
 
@@ -76,7 +75,7 @@ def noncentral_p_value(value: float, freedom: float, noncentrality: float) -> fl
 
 
 def detectable_bias(freedom: float, false_alarm_rate: float, *, power: float = 0.9, window: int = 1) -> float:
-    """Returns the smallest constant bias of innovations that a windowed chi-square test notices.
+    """Returns the smallest constant bias of innovations that a windowed chi-square test detects.
 
     The sum of the normalised innovations squared over ``window`` steps has ``window * freedom`` degrees of freedom; a
     bias b in each makes it non-central by ``window * b^T S^-1 b``.
@@ -84,11 +83,11 @@ def detectable_bias(freedom: float, false_alarm_rate: float, *, power: float = 0
     Args:
         freedom: observed components O.
         false_alarm_rate: probability that the test rejects an unbiased sensor.
-        power: probability with which the bias is to be noticed; larger than the false-alarm rate.
+        power: probability of detecting the bias; larger than the false-alarm rate.
         window: steps of the test.
 
     Returns:
-        Its length in standard deviations of the innovation, the square root of ``b^T S^-1 b``.
+        Norm of the bias in standard deviations of the innovation, the square root of ``b^T S^-1 b``.
 
     Raises:
         ValueError: for probabilities out of range.
@@ -110,7 +109,7 @@ def _double(value: float) -> Tensor:
 
 
 def _root(rises: Callable[[float], float]) -> float:
-    """Finds the root of a function that rises from below zero, for positive arguments."""
+    """Finds the positive root of an increasing function."""
     low, high = 0.0, 1.0
     while rises(high) < 0:
         low, high = high, 2 * high

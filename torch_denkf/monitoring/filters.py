@@ -1,4 +1,4 @@
-"""Filters that watch their sensors, and filters that answer to what they see."""
+"""Filters with a monitor of their sensors, and filters with gating."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ __all__ = ["Gated", "Monitored"]
 
 
 class Monitored(Filter):
-    """A filter with a monitor behind its analyses: next to the belief it writes an alarm, and what speaks for it.
+    """Adds a monitor after a filter's analyses, which writes an alarm and its evidence in addition to the belief.
 
     It is a :class:`Filter` itself: steps, sequences, masks, resets, policies, transforms, replay buffers and compiled
-    steps work as with any other. The belief is that of the filter, bit for bit. The modules are the filter's own, not
-    copies.
+    steps work as with any other. The belief equals that of the filter exactly. The modules are shared with the filter,
+    not copied.
 
     Args:
         filter: the filter.
-        monitor: what to watch, see :class:`~torch_denkf.monitoring.InnovationMonitor`.
+        monitor: monitor of the innovations, see :class:`~torch_denkf.monitoring.InnovationMonitor`.
 
     Raises:
-        TypeError: if the filter is none.
-        KeyError: if the filter does not write what the monitor reads.
+        TypeError: if ``filter`` is no :class:`Filter`.
+        KeyError: if the filter does not write an input of the monitor.
         ValueError: if the filter writes under the monitor's ``monitor_prefix`` already, as another monitor does.
 
     Example:
@@ -84,33 +84,32 @@ class Monitored(Filter):
 
         Args:
             clean: sequences ``[*B, T]`` that the filter can run on, not outputs.
-            **options: of the monitor's.
+            **options: arguments of the monitor's method.
         """
         self.monitor.calibrate([self.sequence(each.copy()) for each in clean], **options)
         return self
 
 
 class Gated(Filter):
-    """A filter whose analyses believe a reading as far as its last innovations deserve it.
+    """Gates each reading of a filter by the last normalised innovations.
 
-    Each analysis becomes a :class:`~torch_denkf.monitoring.GatedAnalysis`, in its place. The filter is a
-    :class:`Filter` itself, like :class:`Monitored`, which goes around this one: ``Monitored(Gated(filter), monitor)``,
-    with ``"gate"`` as the monitor's ``info_prefix``.
+    Each analysis is replaced by a :class:`~torch_denkf.monitoring.GatedAnalysis`. The result is a :class:`Filter`
+    itself. :class:`Monitored` wraps it: ``Monitored(Gated(filter), monitor)``, with ``"gate"`` as the monitor's
+    ``info_prefix``.
 
     Args:
-        filter: of an ensemble, or of a mean and a covariance.
-        observation_dim: components of the readings; by default as the filter's noise models say. By the place of the
-            analysis where there are several.
-        places: of the analyses that get a gate; all by default. With other options for others, put one ``Gated`` around
-            another.
-        **options: of all gates, see :class:`~torch_denkf.monitoring.GateOptions`. Of several the ``gate_prefix``
-            is followed by the analysis' place, ``"gate_camera"``, and by a number where a sequence in one place has
-            several.
+        filter: filter of an ensemble, or of a mean and a covariance.
+        observation_dim: number of components of the readings; by default that of the filter's noise models. For several
+            analyses, a dict by their places.
+        places: places of the analyses to gate; all by default. For different options, nest one ``Gated`` in another.
+        **options: options of all gates, see :class:`~torch_denkf.monitoring.GateOptions`. With several gates the
+            ``gate_prefix`` is followed by the analysis' place, ``"gate_camera"``, and by a number if a sequence in one
+            place has several.
 
     Raises:
         TypeError: if the filter has no analysis that can be gated.
-        ValueError: if the number of components is not known, an option is out of range, or ``adapt_inflation`` is asked
-            of a filter that observes states of the past, a :class:`FusedFilter` with a delay.
+        ValueError: if the number of components is not known, an option is out of range, or ``adapt_inflation`` is used
+            with a filter that observes states of the lag window, such as a :class:`FusedFilter` with a delay.
 
     Example:
         >>> import torch
@@ -176,8 +175,8 @@ class Gated(Filter):
         """Calibrates the gates on clean data, see :meth:`~torch_denkf.monitoring.GatedAnalysis.calibrate`.
 
         Args:
-            clean: sequences ``[*B, T]`` that the filter can run on, not outputs. The gates are open meanwhile.
-            **options: of the gates'.
+            clean: sequences ``[*B, T]`` that the filter can run on, not outputs. The gates are off meanwhile.
+            **options: arguments of the gates' method.
         """
         rates = [gate.rate for gate in self.gates]
         for gate in self.gates:
@@ -190,7 +189,7 @@ class Gated(Filter):
 
 
 def _with_past(part: torch.nn.Module) -> bool:
-    """Returns True if a module observes states of the past, or present and past as one."""
+    """Returns True if a module observes states of the lag window."""
     return isinstance(part, StateObservation) and part.state_dim is not None
 
 
@@ -203,19 +202,19 @@ def _check_filter(name: str, filter: object) -> None:
 
 
 def _analyses(module: TensorDictModuleBase) -> Iterator[Update]:
-    """Yields the analyses of a module of a filter that can be gated."""
+    """Yields the analyses in a filter's module that can be gated."""
     yield from filter(can_be_gated, in_sequences(module))
 
 
 def _with(module: TensorDictModuleBase, old: SubModel, new: SubModel) -> TensorDictModuleBase:
-    """Returns the module, or a plain sequence in which one module is replaced."""
+    """Returns the module with ``old`` replaced by ``new``."""
     if not is_sequence(module):
         return new if module is old else module
     return TensorDictSequential(OrderedDict((name, _with(part, old, new)) for name, part in named_modules_of(module)))
 
 
 def _dim(filter: Filter, analysis: Update) -> int:
-    """Returns the size of an analysis' reading."""
+    """Returns the number of components of an analysis' reading."""
     noise = set(map(unravel_key, analysis.reading_keys[1:]))
     for part in (part for _, module in filter.structure.modules for part in in_sequences(module)):
         dim = role(part, Sensor).observation_dim
@@ -231,11 +230,11 @@ def _dim(filter: Filter, analysis: Update) -> int:
 
 
 def _with_state(initial: TensorDictModuleBase, owners: Sequence[InnovationMonitor | GatedAnalysis]) -> AugmentedBelief:
-    """Returns an initial belief, and the entries that other modules carry on.
+    """Augments an initial belief by the initial states of monitors and gates.
 
     Args:
         initial: the initial belief.
-        owners: such as :class:`InnovationMonitor` and :class:`GatedAnalysis`.
+        owners: modules with a state, :class:`InnovationMonitor` and :class:`GatedAnalysis`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -246,7 +245,7 @@ def _with_state(initial: TensorDictModuleBase, owners: Sequence[InnovationMonito
         >>> start(TensorDict({}, [3]))["monitor", "gps", "p_value"].flatten()
         tensor([1., 1., 1.])
     """
-    # In a tuple the owners are not modules of the belief: the filter has them already.
+    # The tuple keeps the owners from being registered twice: the filter has them already.
     keys = [key for owner in owners for key in owner.state_keys]
     return AugmentedBelief(initial, keys, partial(_states, tuple(owners)))
 

@@ -1,10 +1,10 @@
-"""An analysis with gating: outliers are rejected, or their variances enlarged."""
+"""Analysis with gating: rejects outliers, or enlarges their variances."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, TypedDict, TypeGuard
+from typing import TypedDict, TypeGuard, get_args
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -17,40 +17,40 @@ from torch_denkf.modules.around import Around
 from torch_denkf.modules.kalman import KalmanAnalysis
 from torch_denkf.monitoring._calibration import IDENTITY, check_observation_dim, chi_square_table, empirical_quantile
 from torch_denkf.monitoring.chi_square import chi_square_quantile
-from torch_denkf.monitoring.gating import adapt, disbelief
+from torch_denkf.monitoring.gating import Response, adapt, disbelief
 from torch_denkf.monitoring.innovation_tests import interpolate
 from torch_denkf.submodel import Call, Entries, Update
 
 __all__ = ["GateOptions", "GatedAnalysis"]
 
-_USUAL = 0.05  # probability of a sum that opens a gate that is shut
-_LARGEST_FACTOR = 1e6  # on variances, up or down: what adaptation may reach
+_USUAL = 0.05  # p-value of the sum at which a closed gate opens
+_LARGEST_FACTOR = 1e6  # bound of adapted factors on variances, and of their inverse
 
 
 class GateOptions(TypedDict, total=False):
     """Arguments of :class:`GatedAnalysis` besides the analysis.
 
     Attributes:
-        response: what happens to an outlier: ``"reject"`` takes it out, ``"student"`` and
-            ``"huber"`` enlarge its variances, see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by
-            default. ``"reject"`` may take surprising motions for faults, and the belief then runs away.
+        response: response to an outlier: ``"reject"`` masks it, ``"student"`` and ``"huber"`` enlarge its variances,
+            see :func:`~torch_denkf.monitoring.gating.disbelief`; ``"student"`` by default. ``"reject"`` may mistake
+            large motions for faults, after which the belief diverges.
         window: observed steps whose normalised innovations squared are summed up; 3 by default.
-        rate: probability that the sum of a sound sensor exceeds its limit; 1e-3 by default. 0 is for a gate that never
-            acts.
-        freedom: of Student's t; 4 by default.
-        patience: after so many steps in a row at which a reading was rejected the gate opens: the forecast, and the
-            past states that are carried next to it, are spread until they reach the reading, and the window is emptied.
-            Set more than the longest fault has readings; 50 by default.
-        by_component: whether each component of the reading is judged by itself; for ensembles alone, False by default.
-        adapt_noise: rate at which the reading's variances are adapted to its innovations, about the inverse of the
-            steps that are remembered; 0 by default, for none.
-        adapt_inflation: rate at which the forecast's spread is adapted to the innovations, never below its own;
-            likewise. It acts where a reading is used: the forecast alone, not the past. Innovations tell that something
-            is too small, not what: use one of the two.
+        rate: false-alarm rate, the probability that a fault-free sensor exceeds its limit; 1e-3 by default. 0 turns
+            the gate off.
+        freedom: degrees of freedom of Student's t; 4 by default.
+        patience: number of successive rejections after which the gate opens: forecast and lag window are inflated until
+            they cover the reading, and the window of innovations is emptied. Choose more than the longest fault has
+            readings; 50 by default.
+        by_component: whether each component of the reading is gated separately; only for ensembles, False by default.
+        adapt_noise: rate of adapting the reading's variances to its innovations, about the inverse of the memory in
+            steps; 0 by default, for none.
+        adapt_inflation: rate of inflating the forecast's spread according to the innovations, by a factor of at least
+            1; also 0 by default. It acts on steps with a reading, on the forecast, not on the lag window. Innovations
+            do not tell which of the two is too small: use only one.
         gate_prefix: prefix of the state, ``"gate"`` by default.
     """
 
-    response: Literal["reject", "student", "huber"]
+    response: Response
     window: int
     rate: float
     freedom: float
@@ -62,7 +62,7 @@ class GateOptions(TypedDict, total=False):
 
 
 def can_be_gated(analysis: nn.Module) -> TypeGuard[Update]:
-    """Returns True for an analysis with keys of forecast, reading and diagnostics."""
+    """Returns True for an analysis with known keys of forecast, reading and diagnostics."""
     if isinstance(analysis, Visible):
         return analysis.kind != "particles" and can_be_gated(analysis.module)
     wrapped = isinstance(analysis, Around) and not analysis.updates_ensemble
@@ -75,12 +75,12 @@ def can_be_gated(analysis: nn.Module) -> TypeGuard[Update]:
 
 
 class GatedAnalysis(Around):
-    """Lets a reading count as far as the innovations of the last steps, its own included, deserve it.
+    """Gates a reading by the innovations of the last steps, including its own.
 
-    The analysis runs twice: as it would, to see the innovation, and then with the variances, mask and spread that
-    follow. With ``rate=0`` and no adaptation the second gives bit for bit what the analysis gives.
+    The analysis runs twice: first unchanged, for the innovation, and then with the resulting variances, mask and
+    spread. With ``rate=0`` and no adaptation the result equals that of the analysis exactly.
 
-    What is written next to the belief, K being the number of components with ``by_component`` and else 1:
+    It writes further entries, where K is the number of components with ``by_component``, else 1:
 
     ========================= ============ ============================================================================
     entry                     shape        content
@@ -90,29 +90,28 @@ class GatedAnalysis(Around):
     (key, ``shut``)           ``[K]``      steps in a row at which a reading was rejected
     (key, ``log_noise``)      ``[K]``      logarithm of the adapted factor on the variances
     (key, ``log_inflation``)  ``[1]``      logarithm of the adapted factor on the forecast's variances
-    (key, ``factor``)         ``[K]``      factor on the variances by which the gate answered; infinite where rejected
-    (key, ``nis``)            ``[1]``      of the reading as it came, for an :class:`InnovationMonitor`
+    (key, ``factor``)         ``[K]``      factor of the gate on the variances; infinite for a rejection
+    (key, ``nis``)            ``[1]``      of the ungated reading, for an :class:`InnovationMonitor`
     (key, ``innovation``)     ``[O]``      its innovation
-    (key, ``part_nis``)       ``[K]``      of each component by itself
+    (key, ``part_nis``)       ``[K]``      of each component separately
     ========================= ============ ============================================================================
 
-    Hysteresis: after a rejection, readings are accepted again when the sum falls to what one in twenty exceeds.
+    Hysteresis: after a rejection, readings are accepted again when the sum falls below its 95 % quantile.
 
-    The diagnostics of the analysis, such as ``("info", "nis")``, are those of the second run. A filter needs the state
-    to begin somewhere: :class:`~torch_denkf.monitoring.Gated` sees to that.
+    The diagnostics of the analysis, such as ``("info", "nis")``, are those of the second run. The filter must
+    initialise the state: :class:`~torch_denkf.monitoring.Gated` does.
 
     Args:
         analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, :class:`KalmanAnalysis`,
             :class:`EKFAnalysis` or :class:`UKFAnalysis`; :class:`~torch_denkf.imperfect.Visible` of one of these, whose
-            readings the gate does not count while their probability of being about the state is below one half; or a
-            :class:`LaggedAnalysis`, whose past a reading then corrects likewise. Its keys and its noise
-            are kept.
+            readings the gate ignores while their probability of visibility is below one half; or a
+            :class:`LaggedAnalysis`, whose lag window is gated, too. Its keys and its noise do not change.
         observation_dim: O, components of the reading.
         **options: see :class:`GateOptions`.
 
     Raises:
         TypeError: for another analysis, whose variances and forecast are not known.
-        ValueError: if a number is out of range, or ``by_component`` is asked of a mean and a covariance.
+        ValueError: if a number is out of range, or ``by_component`` is used with a mean and a covariance.
 
     Source:
         Student's t and Huber's loss in filters: Agamennoni, Nieto & Nebot 2012, IEEE Trans. Signal Processing 60;
@@ -140,14 +139,14 @@ class GatedAnalysis(Around):
     claimed: Tensor | None
     observation_dim: int
 
-    reading_dims = Update.reading_dims  # it knows O, and the variances that a Kalman analysis holds are none of its
+    reading_dims = Update.reading_dims  # O is known here; the variances inside a Kalman analysis are not counted
 
     def __init__(
         self,
         analysis: Update,
         observation_dim: int,
         *,
-        response: Literal["reject", "student", "huber"] = "student",
+        response: Response = "student",
         window: int = 3,
         rate: float = 1e-3,
         freedom: float = 4.0,
@@ -168,8 +167,8 @@ class GatedAnalysis(Around):
         of_ensemble = inside.updates_ensemble
         if by_component and not of_ensemble:
             raise ValueError("by_component is for ensembles: an update of mean and covariance is judged as a whole")
-        if response not in ("reject", "student", "huber"):
-            raise ValueError(f'response is "reject", "student" or "huber"; got {response!r}')
+        if response not in get_args(Response):
+            raise ValueError(f"response is one of {', '.join(get_args(Response))}; got {response!r}")
         check_count("observation_dim", observation_dim)
         check_count("window", window)
         check_count("patience", patience)
@@ -223,7 +222,7 @@ class GatedAnalysis(Around):
         if self.adapt_inflation:
             mask = plain.get(self.observed_key)
             inflation = log_inflation.exp()
-            if mask is not None:  # without a reading there is nothing to make up for, and factors would pile up
+            if mask is not None:  # without a reading, inflation would accumulate
                 inflation = torch.where(mask.any(-1, keepdim=True), inflation, 1)
             entries = self._wider(plain, inflation)
         out = self._analyse(entries, call)
@@ -239,7 +238,7 @@ class GatedAnalysis(Around):
         if self.rate:
             evidence, total = terms.sum(-3).unbind(-1)
             limit = self.limits[total.long()] * self.slack
-            if rejects:  # hysteresis: accepted again when it fits well, not when it is just within the limit
+            if rejects:  # hysteresis: a lower limit for accepting again
                 limit = torch.where(shut > 0, self.usual[total.long()], limit)
             limit = limit.to(dtype)
             factor = torch.where(seen, disbelief(evidence, limit, self.response, freedom=self.freedom), 1)
@@ -252,7 +251,7 @@ class GatedAnalysis(Around):
             reach = torch.where(opens, (calibrated / freedom.clamp_min(1)).clamp_min(1), 1).amax(-1, keepdim=True)
             wider = inflation * reach
             if rejects:
-                seen = seen & ~doubted  # an outlier is no measure of the noise
+                seen = seen & ~doubted  # outliers must not adapt the noise
                 wider = torch.where(seen.any(-1, keepdim=True), wider, 1)
             inside = self.module.module if isinstance(self.module, Visible) else self.module
             spread = wider_past(inside, self._wider(plain, wider), reach)
@@ -273,11 +272,11 @@ class GatedAnalysis(Around):
         return {**out, **dict(zip((*self.state_keys, *self._further), own, strict=True))}
 
     def _analyse(self, entries: Entries, call: Call) -> Entries:
-        """Returns what the analysis writes; an ensemble's predictions and reading are plain numbers already."""
+        """Returns the outputs of the analysis; an ensemble's predictions and readings are aligned already."""
         return (self.module.on_aligned if self.of_ensemble else self.module.on_entries)(entries, call)
 
     def _with_noise(self, entries: Entries, call: Call) -> Entries:
-        """Returns the entries with the random numbers that both runs share, and variances of a Kalman analysis."""
+        """Returns the entries with the random numbers for both runs, and the variances of a Kalman analysis."""
         entries = dict(entries)
         if self.claimed is not None:
             mean = self.required(entries, self.in_keys[0])
@@ -285,16 +284,16 @@ class GatedAnalysis(Around):
         return with_draws(self.module, entries, call)
 
     def _parts(self, entries: Entries, nis: Tensor, innovation: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns normalised innovations squared ``[*B, K]``, and how many components were observed in each."""
+        """Returns normalised innovations squared ``[*B, K]``, and the number of observed components in each."""
         mask = entries.get(self.observed_key)
         observed = torch.ones_like(innovation) if mask is None else mask.expand(innovation.shape).to(nis.dtype)
-        if isinstance(self.module, Visible):  # what is not about the state says nothing about the sensor
+        if isinstance(self.module, Visible):  # occluded readings are no evidence about the sensor
             visible = entries.get(self.module.visible_key)
             observed = observed if visible is None else torch.where(visible >= 0.5, observed, 0)
         if not self.by_component:
             return torch.where(observed.any(-1, keepdim=True), nis, 0), observed.sum(-1, keepdim=True)
         predicted, variance = entries[self.module.in_keys[1]], entries[self.noise_variance_key]
-        seen = observed > 0  # what is not observed may be NaN
+        seen = observed > 0  # unobserved components may be NaN
         predicted = predicted.var(-2) if predicted.shape[-2] > 1 else torch.zeros_like(innovation)
         spread = torch.where(seen, predicted, 0) + torch.where(seen, variance, 1)
         return torch.where(seen, innovation.square() / spread, 0), observed
@@ -320,11 +319,11 @@ class GatedAnalysis(Around):
 
     @torch.no_grad()
     def calibrate(self, clean: Sequence[TensorDictBase], *, margin: float = 1.0) -> GatedAnalysis:
-        """Takes the distribution of the innovations, and of their windows, from clean data.
+        """Calibrates the distribution of the innovations, and of their windowed sums, on clean data.
 
         Args:
-            clean: recordings ``[*B, T]``, time last, of ``(gate_prefix, "part_nis")``: what the filter wrote while the
-                gate did nothing.
+            clean: recordings ``[*B, T]``, time last, of ``(gate_prefix, "part_nis")``: outputs of the filter with the
+                gate off.
             margin: factor on the limits.
 
         Returns:
@@ -337,7 +336,7 @@ class GatedAnalysis(Around):
         freedom = self.observation_dim // self.parts_count
         for part in range(self.parts_count):
             values = torch.cat([column[..., part].flatten() for column in columns]).double()
-            values = values[values > 0]  # 0 where a belief begins, or nothing is observed
+            values = values[values > 0]  # 0 at a reset, or if nothing is observed
             if len(values) < 50:
                 raise ValueError(f"calibrate needs 50 steps at which part {part} is observed; there are {len(values)}")
             self.tables[part] = chi_square_table(values, freedom)

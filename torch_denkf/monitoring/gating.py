@@ -1,4 +1,4 @@
-"""Gating of a reading by its own and the last innovations."""
+"""Gating of a reading by its own and the previous innovations."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ Response = Literal["reject", "student", "huber"]
 
 
 def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: float = 4.0) -> Tensor:
-    r"""Returns the factor on a reading's variances: 1 up to the limit, and growing with the evidence from there on.
+    r"""Returns the factor on a reading's variances: 1 up to the limit, and growing with the evidence beyond it.
 
     ============== ===================================== =============================================================
-    response       beyond the limit l                    so that an outlier's pull
+    response       beyond the limit l                    influence of an outlier
     ============== ===================================== =============================================================
-    ``"reject"``   infinity                              is none
-    ``"student"``  :math:`(\nu + q) / (\nu + l)`         falls with its distance, as under Student's t
-    ``"huber"``    :math:`\sqrt{q / l}`                  stays as at the limit, as under Huber's loss
+    ``"reject"``   infinity                              none
+    ``"student"``  :math:`(\nu + q) / (\nu + l)`         falls with its distance, as for Student's t
+    ``"huber"``    :math:`\sqrt{q / l}`                  constant beyond the limit, as for Huber's loss
     ============== ===================================== =============================================================
 
     Args:
-        evidence: q, normalised innovations squared, summed over some steps ``[*]``.
-        limit: l, what the sum seldom exceeds, broadcasts with it; infinite for a gate that never acts.
+        evidence: q, sum of normalised innovations squared over some steps ``[*]``.
+        limit: l, threshold of the sum, broadcasts with it; infinite for a gate that never acts.
         response: one of the three.
         freedom: :math:`\nu` of Student's t; positive.
 
@@ -46,17 +46,17 @@ def disbelief(evidence: Tensor, limit: Tensor, response: Response, *, freedom: f
 
 
 def adapt(log_factor: Tensor, nis: Tensor, freedom: Tensor, rate: float, *, largest: float = 9.0) -> Tensor:
-    r"""Runs one step of stochastic approximation: a factor on a variance grows while innovations are too large.
+    r"""Adapts a factor on a variance by one step of stochastic approximation; it grows while innovations are too large.
 
-    :math:`\log \alpha \leftarrow \log \alpha + \eta (\mathrm{nis} / O - 1)` rests where the normalised innovation
-    squared has its expected mean O (Robbins & Monro 1951), which it has with the true variance.
+    :math:`\log \alpha \leftarrow \log \alpha + \eta (\mathrm{nis} / O - 1)` is stationary if the normalised innovation
+    squared has the mean O (Robbins & Monro 1951), as with the true variance.
 
     Args:
         log_factor: any shape.
         nis: normalised innovation squared, under the factor.
-        freedom: O; where it is 0 nothing changes.
-        rate: :math:`\eta`, about the inverse of the steps that are remembered.
-        largest: nis / O is held below it, so that one outlier counts little.
+        freedom: O; with 0 the factor does not change.
+        rate: :math:`\eta`, about the inverse of the memory in steps.
+        largest: upper bound of nis / O, which limits the influence of an outlier.
 
     Example:
         >>> adapt(torch.zeros(2), torch.tensor([3.0, 1.0]), torch.ones(2), 0.1)

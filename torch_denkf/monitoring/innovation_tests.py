@@ -1,4 +1,4 @@
-"""Tests of one sensor's past innovations: mean size, drift, autocorrelation."""
+"""Tests of one sensor's last innovations: consistency and whiteness."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["InnovationTests", "InnovationWindow", "innovation_tests", "interpola
 
 
 class InnovationWindow(NamedTuple):
-    """Statistics of one sensor's past innovations.
+    """Statistics of one sensor's last innovations.
 
     Attributes:
-        terms: of the last W observed steps, the latest first, ``[*B, W, 4]``: normalised innovation squared, its
-            degrees of freedom, product with the innovation of the observed step before, variance of that product.
-        last: the last normalised innovation ``[*B, O]``; zero where none was observed.
+        terms: statistics of the last W observed steps, the latest first, ``[*B, W, 4]``: normalised innovation squared,
+            its degrees of freedom, inner product with the previous observed innovation, variance of that product.
+        last: last normalised innovation ``[*B, O]``; zero if none was observed.
     """
 
     terms: Tensor
@@ -29,8 +29,8 @@ class InnovationTests(NamedTuple):
     """Result of :func:`innovation_tests`, ``[*B, 1]`` each.
 
     Attributes:
-        p_value: of the mean normalised innovation squared over the window, under its chi-square distribution.
-        whiteness: p-value of the correlation of successive innovations over the window, two-sided.
+        p_value: p-value of the windowed sum of normalised innovations squared, under its chi-square distribution.
+        whiteness: two-sided p-value of the correlation of successive innovations in the window.
     """
 
     p_value: Tensor
@@ -38,12 +38,12 @@ class InnovationTests(NamedTuple):
 
 
 def interpolate(value: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
-    """Interpolates linearly between knots, and extrapolates beyond them from the two nearest.
+    """Interpolates linearly between knots, and extrapolates linearly beyond them.
 
     Args:
         value: any shape ``[*]``.
-        knots: rising, ``[N]`` with N >= 2; or ``[K, N]``, those of each component of ``value`` ``[*, K]``.
-        heights: of the function at the knots, of the same shape.
+        knots: increasing, ``[N]`` with N >= 2; or ``[K, N]`` for each component of ``value`` ``[*, K]``.
+        heights: values of the function at the knots, of the same shape.
 
     Example:
         >>> interpolate(torch.tensor([1.0, 8.0, 16.0]), torch.tensor([0.0, 2.0, 8.0]), torch.tensor([0.0, 1.0, 4.0]))
@@ -63,22 +63,22 @@ def _at(table: Tensor, index: Tensor) -> Tensor:
 def observe(
     window: InnovationWindow, nis: Tensor, innovation: Tensor, freedom: Tensor, scale: Tensor | float = 1.0
 ) -> InnovationWindow:
-    """Returns the window after one more step; as it was where nothing is observed.
+    """Returns the window after one more step; unchanged if nothing is observed.
 
-    The direction of a normalised innovation is that of the innovation in units of ``scale``, its length is the root of
-    ``nis``. With one component that is exact, whatever the scale.
+    The normalised innovation is approximated: it has the direction of the innovation in units of ``scale``, and the
+    square root of ``nis`` as norm. With one component this is exact for any scale.
 
     Args:
-        window: of the steps before.
+        window: window of the steps before.
         nis: normalised innovation squared ``[*B, 1]``.
-        innovation: ``[*B, O]``, 0 where unobserved.
+        innovation: ``[*B, O]``, 0 if not observed.
         freedom: observed components ``[*B, 1]``.
-        scale: usual size of the innovation's components, ``[O]``.
+        scale: typical size of the innovation's components, ``[O]``.
     """
     seen = freedom > 0
     direction = torch.where(seen, innovation / scale, 0)
     square = direction.square().sum(-1, keepdim=True)
-    there = seen & (square > 0) & (nis > 0)  # elsewhere the root has no slope
+    there = seen & (square > 0) & (nis > 0)  # the root has no finite slope at zero
     length = torch.where(there, torch.where(there, nis, 1) / torch.where(there, square, 1), 1).sqrt()
     normalised = torch.where(there, direction * length, 0)
     product = (normalised * window.last).sum(-1, keepdim=True)
@@ -89,7 +89,7 @@ def observe(
 
 
 def innovation_tests(window: InnovationWindow) -> InnovationTests:
-    """Returns p-values of a window's innovations; 1 where nothing was observed yet.
+    """Returns p-values of a window's innovations; 1 before the first observation.
 
     Example:
         >>> terms = torch.tensor([[3.0, 2.0, 0.0, 0.0], [5.0, 2.0, 2.8, 2.0]])  # 8 with 4 degrees of freedom

@@ -1,4 +1,4 @@
-"""Watches the innovations of a filter's sensors, and raises an alarm for each that is inconsistent."""
+"""Monitors the innovations of a filter's sensors, and raises an alarm if a sensor is inconsistent."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from torch_denkf.submodel import SubModel
 
 __all__ = ["InnovationMonitor", "MonitoredSensor"]
 
-_CLAIMS = 3  # steps whose claimed noise is averaged
+_CLAIMS = 3  # steps over which the claimed noise is averaged
 _STATE = ("terms", "last", "cusum", "claim", "p_value", "whiteness", "evidence")
 
 
@@ -40,15 +40,15 @@ class MonitoredSensor(NamedTuple):
     """Keys of a sensor's innovations.
 
     Attributes:
-        info_prefix: prefix of ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``; where a filter has several analyses,
-            an analysis' own, such as ``("info", "camera_analysis")``; of a gated analysis its ``gate_prefix``.
+        info_prefix: prefix of ``innovation`` ``[*B, O]`` and ``nis`` ``[*B, 1]``; with several analyses, that of one
+            analysis, such as ``("info", "camera_analysis")``; of a gated analysis its ``gate_prefix``.
         observation_dim: O.
-        observed_key: the analysis' mask ``[*B, 1]`` or ``[*B, O]``, read where it is there.
-        noise_key: variances that the sensor claims ``[*B, O]``, to be watched, too; ``None`` for none.
-        sign_key: further signs of a fault ``[*B, K]``, see :class:`SignGate`, read where they are there, also in steps
-            at which the sensor is not observed; ``None`` for none.
+        observed_key: optional observed mask ``[*B, 1]`` or ``[*B, O]`` of the analysis.
+        noise_key: optional variances ``[*B, O]`` that the sensor reports, which are monitored, too.
+        sign_key: optional signs of a fault ``[*B, K]``, see :class:`SignGate`, which are also read in steps without an
+            observation.
         signs: K.
-        floor: values up to which a sign is never large, one for all or one for each.
+        floor: lower bounds of the signs' limits, one for all or one for each.
     """
 
     info_prefix: NestedKey
@@ -61,23 +61,24 @@ class MonitoredSensor(NamedTuple):
 
 
 class InnovationMonitor(SubModel):
-    r"""Are a sensor's innovations what the filter expects of them? Tests for each sensor, and one alarm.
+    r"""Tests the consistency of each sensor's innovations with the filter, and raises one alarm.
 
     * The *normalised innovation squared* :math:`d^T S^{-1} d`, summed over a window of observed steps: a chi-square
-      variable while the filter is right.
+      variable while the filter is consistent.
     * A *cumulative sum* of the normal scores of single steps: the fastest test for a change of one size (Page 1954).
     * *Whiteness*: the correlation of successive normalised innovations over the window.
-    * The *claimed noise*, where a sensor learned to say itself that it sees nothing: its innovations are then smaller
-      than usual, not larger. The mean of three steps' scores; it begins to count with :meth:`calibrate`.
-    * *Signs* of any kind, such as the share of a picture that is black: the largest of one step. They, too, begin to
-      count with :meth:`calibrate`.
+    * The *claimed noise*, for a sensor that has learned to report large variances when it sees nothing: its normalised
+      innovations are then smaller than usual, not larger. The statistic is the mean score of three steps, and is used
+      after :meth:`calibrate`.
+    * *Signs* of any kind, such as the black share of an image: the largest of a step. They are also used after
+      :meth:`calibrate`.
 
-    Each is compared with its own distribution. A real filter's innovations are distributed more widely than in theory:
-    members are few, models wrong and errors slow. :meth:`calibrate` takes the distributions from clean data.
+    Each is compared with its own distribution. A real filter's innovations have heavier tails than in theory, because
+    of few members, model errors and coloured noise. :meth:`calibrate` estimates the distributions on clean data.
 
-    The monitor keeps nothing on itself. Its state lies under ``(monitor_prefix, sensor, ...)`` and goes on from step to
-    step where :class:`~torch_denkf.monitoring.Monitored` puts the monitor into a filter. A step at which a sensor is
-    not observed leaves its entries as they are.
+    The monitor is stateless: its state is under ``(monitor_prefix, sensor, ...)`` and is carried from step to step if
+    :class:`~torch_denkf.monitoring.Monitored` puts the monitor into a filter. A step without an observation of a sensor
+    does not change its entries.
 
     ============================== ========= ===========================================================================
     entry                          shape     content
@@ -93,16 +94,17 @@ class InnovationMonitor(SubModel):
     ============================== ========= ===========================================================================
 
     Args:
-        sensors: by name.
-        window: steps.
-        false_alarm_rate: false alarms a step, shared equally by all tests of all sensors; a cumulative sum's is the
-            inverse of its average run length.
-        reference: half of the shift that the cumulative sums find fastest, in standard deviations of a step's score.
-        largest: score that a single step may have, so that several steps decide.
-        ceiling: of the cumulative sums, as a multiple of their limits: how long an alarm may outlast its cause.
-        whiteness: whether the correlation of successive innovations may raise the alarm. Slow errors of a learned
-            sensor fail it on clean data.
-        monitor_prefix: prefix of what is written.
+        sensors: keys of the sensors by name.
+        window: length of the window in steps.
+        false_alarm_rate: false alarms per step, divided equally among all tests of all sensors; for a cumulative sum it
+            is the inverse of the average run length.
+        reference: half of the shift that the cumulative sums detect fastest, in standard deviations of a step's score.
+        largest: bound of a single step's score, so that several steps decide.
+        ceiling: bound of the cumulative sums, as a multiple of their limits, which limits how long an alarm outlasts
+            its cause.
+        whiteness: whether the correlation of successive innovations may raise the alarm. A learned sensor with coloured
+            errors fails this test on clean data.
+        monitor_prefix: prefix of the outputs.
 
     Raises:
         ValueError: if a number is out of range, or there is no sensor.
@@ -175,7 +177,7 @@ class InnovationMonitor(SubModel):
     # ------------------------------------------------------------------------------------------------------ one step
 
     def on_entries(self, entries, call):
-        """Returns state and verdict after one more step."""
+        """Returns state, evidence and alarm after one more step."""
         written = {}
         for place, (name, sensor) in enumerate(self.sensors.items()):
             written.update(self._after(place, name, sensor, entries))
@@ -201,7 +203,7 @@ class InnovationMonitor(SubModel):
         evidence = [cusum / self.cusum_limit[place], _logarithms(tests.p_value, limits[0])]
         claim = old["claim"]
         if noise is not None:
-            # Nothing blurs the beginning of blindness: twice the bound, so that two steps decide.
+            # The reported noise jumps at once: with twice the bound, two steps decide.
             most = 2 * self.largest
             score = self.claim_score(name, noise).clamp(-most, most)
             claim = torch.where(seen, torch.cat([score, claim[..., :-1]], -1), claim)
@@ -214,9 +216,9 @@ class InnovationMonitor(SubModel):
         return dict(zip(keys, values, strict=True))
 
     def claim_score(self, name: str, noise: Tensor) -> Tensor:
-        """Returns the standard normal score of what a sensor claims its variances to be ``[*B, O]``, ``[*B, 1]``.
+        """Returns the standard normal score of a sensor's claimed variances ``[*B, O]``, ``[*B, 1]``.
 
-        It is that of the mean logarithm, among those of the clean data that the monitor was calibrated on.
+        It is the score of their mean logarithm in the distribution of the calibration data.
         """
         place = list(self.sensors).index(name)
         return interpolate(_claimed(noise), *self.claims[place].to(noise.dtype))
@@ -229,17 +231,17 @@ class InnovationMonitor(SubModel):
         return [(signs / getattr(self, f"sign_limit_{name}").to(signs.dtype)).nan_to_num(0.0, posinf=0.0)]
 
     def _read(self, sensor: MonitoredSensor, entries) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-        """Returns normalised innovation squared, innovation, claimed noise, and how many components were observed."""
+        """Returns normalised innovation squared, innovation, claimed noise, and the number of observed components."""
         info = unravel_key(sensor.info_prefix)
         info = (info,) if isinstance(info, str) else info
         nis, innovation = (self.required(entries, (*info, entry)) for entry in ("nis", "innovation"))
         check_observation_dim(sensor.observation_dim, innovation, f"the monitored sensor at {sensor.info_prefix!r}")
         noise = None if sensor.noise_key is None else self.required(entries, unravel_key(sensor.noise_key))
         mask = entries.get(unravel_key(sensor.observed_key))
-        # Without a mask to be read, as where an observation model makes it: what is not observed has no innovation.
+        # Without a mask in the entries, components with a zero innovation count as not observed.
         seen = innovation != 0 if mask is None else mask.expand(innovation.shape)
         count = seen.sum(-1, keepdim=True).to(nis.dtype)
-        return nis, innovation, noise, torch.where(nis > 0, count, 0)  # it is 0 where a belief begins
+        return nis, innovation, noise, torch.where(nis > 0, count, 0)  # nis is 0 at a reset
 
     def _sum(self, total: Tensor, score: Tensor, seen: Tensor, limit: Tensor) -> Tensor:
         ceiling = (self.ceiling * limit).to(total.dtype)
@@ -261,17 +263,17 @@ class InnovationMonitor(SubModel):
 
     @torch.no_grad()
     def calibrate(self, clean: Sequence[TensorDictBase], *, margin: float = 1.0) -> InnovationMonitor:
-        """Takes the distributions of the tests from innovations on clean data.
+        """Calibrates the distributions of the tests on clean data.
 
         Quantiles of the normalised innovation squared are mapped to those of the chi-square distribution, those of the
-        claimed noise to normal scores. Then each test's limit becomes its quantile on the data, where theory's is not
-        stricter.
+        claimed noise to normal scores. Then each test's limit becomes its quantile on the data, unless the theoretical
+        limit is farther out.
 
         Args:
-            clean: recordings ``[*B, T]``, time last: what a filter wrote, with the entries that the monitor reads; an
-                episode begins at the first step, and where ``is_init`` says so. To know a limit takes about ten times
-                as many steps as lie between two false alarms.
-            margin: factor on the limits, where the data are fewer or less varied than what will come.
+            clean: recordings ``[*B, T]``, time last: the outputs of a filter, with the entries that the monitor reads;
+                an episode begins at the first step, and at each ``is_init``. A reliable limit needs about ten times as
+                many steps as the mean time between false alarms.
+            margin: factor on the limits, for data that are fewer or less varied than those in use.
 
         Returns:
             This monitor.
@@ -318,13 +320,13 @@ class InnovationMonitor(SubModel):
             if sensor.noise_key is not None:
                 means = [each[self.monitor_prefix, name, "claim"].double().mean(-1).flatten() for each in tests]
                 found = float(empirical_quantile(torch.cat(means), torch.tensor([1 - self.share])))
-                # The scores of successive frames may be one: then their mean is a normal number, too.
+                # Scores of successive frames may be fully correlated: then their mean is standard normal, too.
                 normal = -float(torch.special.ndtri(torch.tensor(self.share, dtype=torch.float64)))
                 self.claim_limit[place] = margin * max(normal, found)
 
     @torch.no_grad()
     def replay(self, recorded: TensorDictBase) -> TensorDictBase:
-        """Returns the monitor's entries on what a filter has written before, ``[*B, T]``, time last."""
+        """Returns the monitor's entries from a filter's outputs ``[*B, T]``, time last."""
         batch, entries = recorded.batch_size[:-1], _entries(recorded)
         read = [key for key in (*self.in_keys, *self.optional_keys, "is_init") if key not in self.state_keys]
         rows = recorded.select(*(key for key in read if key in entries)).unbind(-1)
@@ -344,16 +346,15 @@ class InnovationMonitor(SubModel):
         return torch.stack(out, len(batch))
 
     def detectable_bias(self, power: float = 0.9) -> dict[str, float]:
-        """Returns the smallest constant bias of each sensor's innovations that the windowed test finds, at its limit.
+        """Returns the smallest constant bias of each sensor's innovations that the windowed test detects.
 
-        The filter follows a biased sensor, so that the innovation's bias is smaller than the sensor's. What is smaller
-        than this is not noticed within a window, and a gate does nothing against it.
+        The filter follows a biased sensor, so that the innovation's bias is smaller than the sensor's. Neither this
+        test nor a gate detects a smaller bias.
 
         Args:
-            power: probability with which it is to be found.
+            power: probability of detection.
 
-        Returns:
-            By sensor, in standard deviations of its innovation.
+        Returns: Bias by sensor, in standard deviations of its innovation.
         """
         limits = self.p_limit.double().clamp_min(1e-300).tolist()
         return {

@@ -1,4 +1,4 @@
-"""Readings whose own signs say that the sensor fails."""
+"""Gates readings by signs of a sensor fault, such as the share of black in an image."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ __all__ = ["SignGate"]
 
 
 class SignGate(Sensor):
-    """Marks readings as not observed whose signs are larger than they are on clean data.
+    """Marks readings as not observed if a sign of a fault exceeds its limit, which is calibrated on clean data.
 
-    A *sign* is a number that is small while a sensor is sound and large when it fails, whatever it reads: the share of
-    a picture that is black (:func:`torch_denkf.applications.car.vision.signs.picture_signs`), the residual of a fit, a
-    motor's temperature. It tells at once what innovations tell after some steps, or never. Put this module in front of
-    the filter, or of its sensor; an :class:`InnovationMonitor` raises its alarm by the same signs.
+    A *sign* is a scalar that is small while a sensor works and large when it fails, independently of its reading: the
+    share of an image that is black (:func:`torch_denkf.applications.car.vision.signs.picture_signs`), the residual of a
+    fit, a motor's temperature. A sign shows a fault at once; innovations show it after some steps, or never. Put this
+    module before the filter, or before its sensor. An :class:`InnovationMonitor` can use the same signs.
 
     Args:
-        count: K, signs of a reading.
-        rate: share of the clean readings that are marked, all signs together.
-        floor: values up to which a sign is never large, one for all signs or one for each.
-        sign_key: the signs ``[*B, K]``. NaN says nothing.
-        observed_key: optional mask ``[*B, 1]`` or ``[*B, O]`` of readings that were missing before.
-        out_key: the mask, of the same shape: False where a sign is large, and where a reading was missing before. Let
-            the filter read it, ``observed_key="seen"``.
+        count: K, the number of signs of a reading.
+        rate: share of the clean readings that all signs together reject.
+        floor: lower bounds of the limits, one for all signs or one for each.
+        sign_key: the signs ``[*B, K]``. NaN stands for an unknown sign, which never rejects.
+        observed_key: optional observed mask ``[*B, 1]`` or ``[*B, O]``.
+        out_key: new mask of the same shape: False if a sign exceeds its limit, or ``observed_key`` is False. Pass it to
+            the filter as ``observed_key="seen"``.
 
     Raises:
         ValueError: if a number is out of range, or both masks have one key.
@@ -65,17 +65,17 @@ class SignGate(Sensor):
         self.register_buffer("limits", torch.full((count,), torch.inf))
 
     def compute(self, signs: Tensor, before: Tensor | None = None) -> Tensor:
-        """Returns the mask."""
+        """Returns the observed mask."""
         sound = ~(signs > self.limits.to(signs.dtype)).any(-1, keepdim=True)
         return sound if before is None else sound & before
 
     @torch.no_grad()
     def calibrate(self, clean: Sequence[TensorDictBase], *, margin: float = 1.0) -> SignGate:
-        """Takes from clean data what is large.
+        """Sets the limits to quantiles of the signs on clean data.
 
         Args:
             clean: recordings ``[*B]`` with the signs.
-            margin: factor on the limits, where the data are fewer or less varied than what will come.
+            margin: factor on the limits, for data that are fewer or less varied than those in use.
 
         Returns:
             This module.
@@ -86,10 +86,10 @@ class SignGate(Sensor):
 
 
 def floors(floor: float | Sequence[float], count: int) -> Tensor:
-    """Floors ``[K]``.
+    """Returns the floors ``[K]``.
 
     Raises:
-        ValueError: if there are not K of them, or one is negative.
+        ValueError: if the number of values is not K, or one is negative.
     """
     values = [floor] * count if isinstance(floor, (int, float)) else list(floor)
     if len(values) != count:

@@ -1,9 +1,9 @@
-"""Known motions, and what sensors read of their states: inertial sensors, poses, landmarks.
+"""Known motions, and observations of their states: inertial sensors, poses, landmarks.
 
-Linear motions in continuous time move plain numbers. Another motion's state is a point of a space, see
+Linear motions in continuous time have vectors as states. Another motion's state is a point of a space, see
 :mod:`torch_denkf.functional.manifolds`: orientation first, as a unit quaternion with w first, or as an angle in the
-plane; the world's z points up. Motions draw no noise. ``process_noise`` of a motion says how much of it a filter is to
-add after each step: one standard deviation for each number of a tangent.
+plane; the world's z points up. Motions draw no noise. ``process_noise`` of a motion has the standard deviations of the
+noise that a filter adds after each step, one for each component of a tangent.
 """
 
 from torch_denkf.motions.continuous import ContinuousMotion, ContinuousNoise, NoisePerSecond

@@ -1,4 +1,4 @@
-"""A body whose gyro and accelerometer say how it moves.
+"""Motions driven by a gyro and an accelerometer.
 
 Source: Forster, Carlone, Dellaert & Scaramuzza 2017, IEEE T-RO 33 (the model); Fourmy, Flayols, Léziart, Mansard & Solà
 2021, ICRA, and Brossard, Barrau, Chauchat & Bonnabel 2022, IEEE T-RO 38 (the exact integrals).
@@ -29,26 +29,25 @@ __all__ = ["AttitudeMotion", "InertialMotion", "move_inertially"]
 
 
 class InertialMotion(Motion):
-    r"""Orientation, velocity and position, moved by what a gyro and an accelerometer read: inertial navigation.
+    r"""Inertial navigation: orientation, velocity and position, driven by gyro and accelerometer.
 
     The state is a point of ``Product(SE23(), Euclidean(3), Euclidean(3))``, 16 numbers: orientation, velocity in m/s
-    and position in m, both in the world's axes; then what the gyro reads too much, in rad/s, and the accelerometer, in
-    m/s^2, both in the body's axes. The tangent has 15 numbers, three for each of these.
+    and position in m, both in the world's axes; then the biases of the gyro, in rad/s, and of the accelerometer, in
+    m/s^2, both in the body's axes. The tangent has 15 components, three for each of these.
 
-    The readings drive the motion, so they are no reading of an analysis. That of a step is what the sensors read while
-    it lasted. Of sensors that are sampled where it begins and ends, take the mean of both: then the error of a step
-    falls with the third power of its length. An accelerometer reads specific force: at rest it reads ``gravity``
-    upwards.
+    The readings are inputs of the motion, not of an analysis: the mean over the step. For sensors that are sampled at
+    the beginning and the end of a step, use the mean of both: the error of a step is then of third order in its length.
+    An accelerometer reads specific force: at rest it reads ``gravity`` upwards.
 
     The integration is exact where rate and specific force are constant in the body's axes, see
     :func:`move_inertially`. The body is where the accelerometer sits.
 
-    Noises are what a data sheet calls densities. A data sheet that has degrees and micro-g: 0.005 deg/s/sqrt(Hz) is
-    8.7e-5 rad/s/sqrt(Hz), and 400 ug/sqrt(Hz) is 3.9e-3 m/s^2/sqrt(Hz).
+    Noises are the densities in data sheets. Conversions from degrees and micro-g: 0.005 deg/s/sqrt(Hz) is 8.7e-5
+    rad/s/sqrt(Hz), and 400 ug/sqrt(Hz) is 3.9e-3 m/s^2/sqrt(Hz).
 
     Args:
         dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
-        gyro_noise: density of its white noise in rad/s/sqrt(Hz); a number, or one for each axis.
+        gyro_noise: density of the gyro's white noise in rad/s/sqrt(Hz); a number, or one for each axis.
         accelerometer_noise: in m/s^2/sqrt(Hz).
         gyro_walk: of the random walk of its bias, in rad/s^2/sqrt(Hz): standard deviation after a second, in rad/s.
         accelerometer_walk: in m/s^3/sqrt(Hz).
@@ -127,11 +126,10 @@ class InertialMotion(Motion):
 
 
 class AttitudeMotion(Motion):
-    r"""An orientation, moved by what a gyro reads: :math:`R' = R \exp((\omega - b) \Delta t)`.
+    r"""Motion of an orientation driven by a gyro: :math:`R' = R \exp((\omega - b) \Delta t)`.
 
-    The state is a point of ``Product(SO3(), Euclidean(3))``, 7 numbers: the orientation, and what the gyro reads too
-    much, in rad/s. The tangent has 6 numbers. See :class:`InertialMotion` for velocity and position, and for what a
-    reading belongs to.
+    The state is a point of ``Product(SO3(), Euclidean(3))``, 7 numbers: the orientation, and the gyro's bias, in rad/s.
+    The tangent has 6 components. See :class:`InertialMotion` for velocity and position, and for the time of a reading.
 
     Args:
         dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
@@ -197,8 +195,8 @@ def move_inertially(pose: Tensor, rate: Tensor, force: Tensor, dt: float | Tenso
         v' &= v + g \Delta t + R \, \Gamma_1(\omega \Delta t) \, f \Delta t \\
         p' &= p + v \Delta t + g \Delta t^2 / 2 + R \, \Gamma_2(\omega \Delta t) \, f \Delta t^2
 
-    :math:`\Gamma_k` is the integral of the turn, taken k times. No step is too long: nothing is cut off. The earth does
-    not turn.
+    :math:`\Gamma_k` is the k-fold integral of the rotation. The result is exact for steps of any length. The earth's
+    rotation is neglected.
 
     Args:
         pose: orientation, velocity in m/s and position in m, points ``[*, 10]`` of ``SE23``.

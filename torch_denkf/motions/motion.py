@@ -60,7 +60,7 @@ class Motion(Transition):
         raise NotImplementedError
 
     def move_and_gradient(self, *values: Any, **dt: Any) -> tuple[Tensor, Tensor]:
-        """Returns both, which may share what they need."""
+        """Returns both, which may share computations."""
         return self.move(*values, **dt), self.gradient(*values, **dt)
 
     def noise_of_step(self, dt: Any) -> list:

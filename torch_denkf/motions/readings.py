@@ -17,10 +17,10 @@ __all__ = ["Gravity", "Magnetic", "PoseOf", "PositionInBody", "RangeBearing"]
 
 
 class _Reading(SubModel):
-    """Reads one part of the forecast states ``[*B, E, P]``, writes the predicted reading ``[*B, E, Q]``.
+    """Base of measurement models h of one part of the state: maps ``[*B, E, P]`` to predicted readings ``[*B, E, Q]``.
 
     Attributes:
-        reading_space: the space of what is written.
+        reading_space: the space of the predicted readings.
     """
 
     kinds: tuple[type[Space], ...] = (Space,)
@@ -49,7 +49,7 @@ class _Reading(SubModel):
         raise NotImplementedError
 
     def gradient(self, point: Tensor, reading: Tensor) -> Tensor:
-        """Returns the Jacobian of :meth:`observe` from the part's tangents to those of the reading; optional."""
+        """Returns the Jacobian of :meth:`observe`, from tangents of the part to tangents of the reading; optional."""
         raise NotImplementedError
 
     def compute(self, ensemble, *given):
@@ -58,16 +58,16 @@ class _Reading(SubModel):
         return self.observe(ensemble.narrow(-1, self.begin, self.read_space.point_dim))
 
     def jacobian(self, ensemble, *given):
-        """Zero but for the part that is read."""
+        """Returns the predicted readings and their Jacobian, which is zero outside of the observed part."""
         reading = self.compute(ensemble, *given)
         matrix = self.gradient(ensemble.narrow(-1, self.begin, self.read_space.point_dim), reading)
         return reading, nn.functional.pad(matrix, self._beside) if any(self._beside) else matrix
 
 
 class PoseOf(_Reading):
-    """One part of a state, its pose for example, as it is: what a motion capture system or a satellite receiver reads.
+    """Observes one part of the state directly, such as its pose: a motion capture system or a satellite receiver.
 
-    The reading is a point of that part's space, ``reading_space``; its noise has one number for each of a tangent.
+    The reading is a point of that part's space, ``reading_space``; its noise has the dimension of the tangent space.
 
     Args:
         space: of the states.
@@ -103,7 +103,7 @@ class PoseOf(_Reading):
 
 
 class Magnetic(_Reading):
-    r"""A direction of the world seen from the body, :math:`R^\top m`: what a magnetometer reads.
+    r"""Observes a vector of the world in the body's axes, :math:`R^\top m`: a magnetometer.
 
     Args:
         space: of the states.
@@ -143,7 +143,7 @@ class Magnetic(_Reading):
         return rotate(point[..., :4], self.field, back=True)
 
     def gradient(self, point, reading):
-        """Returns the Jacobian: a turn of the body turns the direction back."""
+        """Returns the Jacobian: a rotation of the body rotates the vector back."""
         others = self.read_space.tangent_dim - 3
         return nn.functional.pad(skew(reading), (0, others)) if others else skew(reading)
 
@@ -183,14 +183,14 @@ class Gravity(Magnetic):
 
 
 class PositionInBody(_Reading):
-    r"""Observes landmarks in the body's axes, :math:`R^\top (l - p)`: as a stereo camera or a lidar does.
+    r"""Observes landmarks in the body's axes, :math:`R^\top (l - p)`: a stereo camera or a lidar.
 
     Args:
         space: of the states.
-        landmark: where it lies in the world, ``[3]``, in the plane ``[2]``; of several ``[L, 3]`` or ``[L, 2]``.
-        landmark_key: in its place, an entry of the data that says it in each row, ``[*B, 3 L]`` or ``[*B, 2 L]``, as
-            for a landmark that is recognised; what a row lacks is hidden by a mask ``[*B, O]`` of the readings.
-        count: L, of the entry.
+        landmark: position in the world, ``[3]``, in the plane ``[2]``; of several landmarks ``[L, 3]`` or ``[L, 2]``.
+        landmark_key: instead of ``landmark``, an entry with the positions of each row, ``[*B, 3 L]`` or ``[*B, 2 L]``,
+            for landmarks that are recognised; an observed mask ``[*B, O]`` tells which are missing in a row.
+        count: L, the number of landmarks in the entry.
         part: the place of the pose, ``SE2()``, ``SE3()`` or ``SE23()``, in a ``Product``.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 L]``, in the plane ``[*B, E, 2 L]``.
@@ -235,7 +235,7 @@ class PositionInBody(_Reading):
         self._of_readings(self.space_of_reading(count))
 
     def space_of_reading(self, count: int) -> Space:
-        """The space of readings of so many landmarks."""
+        """Returns the space of the readings of ``count`` landmarks."""
         return Euclidean(self.size * count)
 
     def compute(self, ensemble, *given):
@@ -250,15 +250,15 @@ class PositionInBody(_Reading):
         return self.seen(point, given[0].to(ensemble.dtype).unsqueeze(-2).unflatten(-1, (-1, self.size))).flatten(-2)
 
     def observe(self, point):
-        """The landmarks that are known beforehand, one after the other."""
+        """Returns the given landmarks in the body's axes, concatenated."""
         return self.seen(point, self.landmark.reshape(-1, self.size)).flatten(-2)
 
     def gradient(self, point, reading):
-        """Returns the Jacobian: a turn of the body turns landmarks back; they come nearer as it moves towards them."""
+        """Returns the Jacobian: landmarks rotate and move opposite to the body."""
         return self._by_pose(reading)
 
     def _by_pose(self, seen: Tensor) -> Tensor:
-        """The Jacobian ``[*, N L, D]`` of landmarks that lie at ``seen`` ``[*, N L]``."""
+        """Returns the Jacobian ``[*, N L, D]`` of landmarks at ``seen`` ``[*, N L]`` in the body's axes."""
         seen = seen.unflatten(-1, (-1, self.size))
         turn = skew(seen) if self.size == 3 else torch.stack([seen[..., 1], -seen[..., 0]], -1).unsqueeze(-1)
         nearer = -torch.eye(self.size, dtype=seen.dtype, device=seen.device).expand(*seen.shape, self.size)
@@ -266,7 +266,7 @@ class PositionInBody(_Reading):
         return torch.cat([turn, between, nearer], -1).flatten(-3, -2)
 
     def seen(self, point: Tensor, landmark: Tensor) -> Tensor:
-        """The landmarks ``[*, L, N]`` in the body's axes."""
+        """Returns the landmarks ``[*, L, N]`` in the body's axes."""
         away = landmark - point[..., -self.size :].unsqueeze(-2)
         if self.size == 3:
             return rotate(point[..., None, :4], away, back=True)
@@ -276,20 +276,20 @@ class PositionInBody(_Reading):
 
 
 class RangeBearing(PositionInBody):
-    """Range and bearing of landmarks in the plane: how far, and by how much to the left of straight ahead.
+    """Observes range and bearing of landmarks in the plane; the bearing is positive to the left.
 
-    Of each the second number is an angle: the reading is a point of ``Product(Euclidean(1), Circle(), ...)``,
-    ``reading_space``.
+    The reading is a point of ``Product(Euclidean(1), Circle(), ...)``, ``reading_space``: a length and an angle for
+    each landmark.
 
     Args:
         space: of the states.
-        landmark: where it lies in the world, ``[2]``; of several ``[L, 2]``.
-        landmark_key: in its place, an entry of the data that says it in each row, ``[*B, 2 L]``, as for a landmark that
-            is recognised by a barcode.
-        count: L, of the entry.
+        landmark: position in the world, ``[2]``; of several landmarks ``[L, 2]``.
+        landmark_key: instead of ``landmark``, an entry with the positions of each row, ``[*B, 2 L]``, for landmarks
+            that are recognised, by a barcode for example.
+        count: L, the number of landmarks in the entry.
         part: the place of the pose, ``SE2()``, in a ``Product``.
         in_key: states to observe ``[*B, E, P]``.
-        out_key: predicted readings ``[*B, E, 2 L]``: of each the unit of length, and rad.
+        out_key: predicted readings ``[*B, E, 2 L]``: range in the unit of length, and bearing in rad.
 
     Raises:
         TypeError: if the part is no pose in the plane.
@@ -306,11 +306,11 @@ class RangeBearing(PositionInBody):
     kinds = (SE2,)
 
     def space_of_reading(self, count):
-        """A length and an angle for each."""
+        """Returns the product of a length and an angle for each landmark."""
         return Product(*[Euclidean(1), Circle()] * count)
 
     def seen(self, point, landmark):
-        """Ranges and bearings; at a landmark itself zero, and so is their gradient."""
+        """Returns ranges and bearings; they and their gradients are zero at the landmark itself."""
         away = super().seen(point, landmark)
         there = (away == 0).all(-1, keepdim=True)
         away = torch.where(there, torch.ones_like(away), away)
@@ -318,7 +318,7 @@ class RangeBearing(PositionInBody):
         return torch.where(there, torch.zeros_like(polar), polar)
 
     def gradient(self, point, reading):
-        """That of range and bearing by where each landmark lies, times that of this."""
+        """Returns the Jacobian by the chain rule: range and bearing by position in the body, times the base class's."""
         distance, angle = reading.unflatten(-1, (-1, 2)).unbind(-1)
         ahead = torch.stack([angle.cos(), angle.sin()], -1)
         across = torch.stack([-ahead[..., 1], ahead[..., 0]], -1) / torch.where(distance == 0, 1, distance)[..., None]
@@ -328,10 +328,10 @@ class RangeBearing(PositionInBody):
 
 
 def _register_vectors(module: nn.Module, name: str, value: Sequence | Tensor, *shapes: list[int]) -> None:
-    """Keeps finite numbers of one of these shapes.
+    """Registers a constant, and checks that it is finite and has one of the shapes.
 
     Raises:
-        ValueError: if they have another one.
+        ValueError: if it has another shape.
     """
     register_constant(module, name, value)
     found = getattr(module, name)

@@ -11,7 +11,7 @@ __all__ = ["attitude_of", "stands_still"]
 
 
 def attitude_of(acceleration: Tensor, magnetic: Tensor | None = None, *, declination: float = 0.0) -> Tensor:
-    """Returns the attitude at which an accelerometer, and a magnetometer, read what they do while a body stands still.
+    """Returns the attitude of a body at rest from its accelerometer, and its magnetometer.
 
     Args:
         acceleration: specific force in the body's axes ``[*B, 3]``, upwards where it stands still; in any unit.
@@ -43,7 +43,7 @@ def attitude_of(acceleration: Tensor, magnetic: Tensor | None = None, *, declina
 
 
 def _quaternion(matrix: Tensor) -> Tensor:
-    """The unit quaternion of a rotation matrix ``[*B, 3, 3]``, by its largest part, so that no digits are lost."""
+    """Returns the unit quaternion of a rotation matrix ``[*B, 3, 3]``, by its largest component for precision."""
     a, b, c = matrix.diagonal(dim1=-2, dim2=-1).unbind(-1)
     squares = torch.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], -1)  # four times
     x, y, z = (matrix[..., j, i] - matrix[..., i, j] for i, j in ((1, 2), (2, 0), (0, 1)))

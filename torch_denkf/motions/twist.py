@@ -1,4 +1,4 @@
-"""A pose that goes on moving as it does."""
+"""A pose that continues moving as it does."""
 
 from __future__ import annotations
 

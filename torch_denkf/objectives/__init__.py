@@ -1,4 +1,4 @@
-"""Training objectives, torchrl loss modules: of whole filters, and of their parts alone."""
+"""Training objectives as torchrl loss modules: for whole filters, and for single parts."""
 
 from torch_denkf.objectives.filter_loss import Term
 from torch_denkf.objectives.parts import ObservationLoss, SensorLoss, TransitionLoss

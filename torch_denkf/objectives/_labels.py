@@ -1,7 +1,7 @@
-"""Labels of losses: the true values that are known, and their components.
+"""Labels of losses: the known true values, and their components.
 
-Labels ``[*B, N]`` are of the leading N components, or of the components that ``dims`` names. What is NaN, what a mask
-of labels leaves out and what is padding is no label: it has no value and no gradient, and no mean counts it.
+Labels ``[*B, N]`` are of the leading N components, or of the components ``dims``. NaN, masked and padded entries are
+no labels: they have no value and no gradient, and are left out of means.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ __all__ = ["Keys", "Labels", "Reading", "Targets", "check_row_mask", "mean_of"]
 
 @dataclass
 class Keys:
-    """The entries that all losses read.
+    """The common input keys of all losses.
 
     Attributes:
-        state: true state ``[*B, N]``, of the leading N components of the state; NaN where it is not known. Of
+        state: true state ``[*B, N]``, of the leading N components of the state; NaN where it is not known. For
             sequences ``*B`` ends with time, here and below.
-        state_observed: which of them are known, ``[*B, 1]`` or ``[*B, N]``, bool; by default the state's name and
-            ``_observed``, as data sets write it. It may be missing.
-        target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
-            no parameters, it is that model's observation of the true state.
-        target_observed: which components of the true observation are known, ``[*B, 1]`` or ``[*B, O]``, bool.
-        observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``; by default the one that the sensor's update reads.
-        sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one sensor of several; by
-            default those that the filter's one sensor writes.
-        visible: probability that the reading is about the state, ``[*B, 1]``, as a head next to the sensor says.
-        target_visible: whether it is, ``[*B, 1]``, bool or 0 and 1; NaN where that is not known.
-        visible_observed: where it is known, ``[*B, 1]``, bool; by default its name and ``_observed``.
+        state_observed: mask of its known components, ``[*B, 1]`` or ``[*B, N]``, bool; by default the state's name
+            and ``_observed``, as in data sets. It may be missing.
+        target_observation: true observation ``[*B, O]``; if it is missing and the filter's observation model has
+            no parameters, that model's observation of the true state is used.
+        target_observed: mask of the known components of the true observation, ``[*B, 1]`` or ``[*B, O]``, bool.
+        observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``; by default that of the sensor's update.
+        sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one of several sensors; by
+            default the output of the filter's only sensor.
+        visible: probability that the reading is of the state, ``[*B, 1]``, from a head of the sensor.
+        target_visible: whether it is, ``[*B, 1]``, bool or 0 and 1; NaN if that is not known.
+        visible_observed: mask of its known elements, ``[*B, 1]``, bool; by default its name and ``_observed``.
     """
 
     state: NestedKey = "state"
@@ -65,9 +65,9 @@ class Reading(NamedTuple):
 
     Attributes:
         samples: its key.
-        observed: its mask.
-        noise: its R.
-        model: module that predicts it, with an ``observe()`` method; ``None`` where there is none.
+        observed: key of its mask.
+        noise: key of its R.
+        model: the observation model, with an ``observe()`` method; ``None`` if there is none.
     """
 
     samples: NestedKey = ("sensor", "ensemble")
@@ -77,7 +77,7 @@ class Reading(NamedTuple):
 
     @classmethod
     def of(cls, filter: Filter, keys: Keys) -> Reading:
-        """Finds the reading of the sensor that ``keys`` name, or of the only one; no model where there are several."""
+        """Finds the reading of the sensor in ``keys``, or of the only one; without a model for several sensors."""
         found: dict[NestedKey, Update] = {}
         default, observed = cls(), keys.observed
         for _, module in filter.structure.update:
@@ -100,14 +100,14 @@ class Reading(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """True values, as far as they are known and count.
+    """True values that are known and scored.
 
     Attributes:
-        values: ``[*B, N]``; zero where there is no label. Points ``[*B, P]`` of a space, neutral where there is none.
-        mask: ``[*B, N]``, True where there is one. N are the tangents' components of a space.
-        dims: of the N components those that count.
+        values: ``[*B, N]``; zero without a label. On a space points ``[*B, P]``, neutral without a label.
+        mask: ``[*B, N]``, True where there is a label. On a space N is the dimension of tangents.
+        dims: scored components among the N.
         scale: ``[N]``, finite, by which errors are divided; ``None`` for one.
-        space: the space whose points they are; ``None`` of plain numbers.
+        space: space of the values; ``None`` for plain numbers.
     """
 
     values: Tensor
@@ -122,17 +122,17 @@ class Labels(NamedTuple):
         return self.mask.any(-1)
 
     def errors(self, estimate: Tensor, weights: Tensor | None = None, *, each: bool = False) -> Tensor:
-        """Returns scaled errors of an estimate ``[*B, N]``, or of members ``[*B, E, N]``; zero where there is no label.
+        """Returns scaled errors of an estimate ``[*B, N]``, or of members ``[*B, E, N]``; zero without a label.
 
-        In a space they are tangents. Those of members and of the truth are taken at the members' mean, and subtracted:
-        members that are drawn like the truth then have tangents that are distributed like the truth's, and their score
-        is proper. At the truth their axes turn with it, and a spread that is not the truth's scores best. The mean is
-        a constant to the gradient: it only lays the axes.
+        On a space they are tangents. Tangents of members and of the truth are taken at the members' mean, and
+        subtracted: if members and truth have the same distribution, so have their tangents, and the score is proper.
+        At the truth the axes would rotate with it, and the best score would have a wrong spread. The mean is a constant
+        to the gradient, because it only defines the axes.
 
         Args:
-            estimate: of points ``[*B, P]``, or ``[*B, E, P]``, where there is a space.
-            weights: of members, ``[*B, E]``, for their mean; ``None`` for equal ones.
-            each: of members each on its own, in the tangent space at the truth.
+            estimate: on a space points ``[*B, P]``, or ``[*B, E, P]``.
+            weights: weights of members, ``[*B, E]``, for their mean; ``None`` for equal weights.
+            each: whether errors of members are taken in the tangent space at the truth.
         """
         values, mask, space = self.values, self.mask, self.space
         members = estimate.ndim > values.ndim
@@ -152,14 +152,14 @@ class Labels(NamedTuple):
         return mean_of(scores, self.mask)
 
     def in_all_components(self, name: str, value: Tensor) -> Tensor:
-        """Returns one number for each of the N components, 1 where none is given.
+        """Expands a value to each of the N components, with 1 for components without one.
 
         Args:
-            name: its own, for the message.
-            value: one number, or one for each of ``dims``; where these are the leading ones, also one for each of N.
+            name: name of the value, for the message.
+            value: one number, or one for each of ``dims``; if these are the leading ones, also one for each of N.
 
         Raises:
-            ValueError: if there are more or fewer.
+            ValueError: if the number of values is different.
         """
         size = self.mask.shape[-1]
         if value.numel() == 1 or (value.numel() == size and isinstance(self.dims, range)):
@@ -173,7 +173,7 @@ class Labels(NamedTuple):
         return out
 
     def scaled(self, name: str, scale: Tensor | None) -> Labels:
-        """Sets a scale, see :meth:`in_all_components`; where that is infinite, a component is no label."""
+        """Sets a scale, see :meth:`in_all_components`; components with an infinite scale are no labels."""
         if scale is None:
             return self
         scale = self.in_all_components(name, scale)
@@ -184,19 +184,19 @@ class Labels(NamedTuple):
 
 
 class Targets:
-    """Holds the labels of a batch that terms are scored against, and what the filter wrote.
+    """Labels of a batch for the terms, together with the filter's outputs.
 
     Args:
-        loss: whose names of entries, dimensions, scales and spaces count.
+        loss: the loss, with its keys, dimensions, scales and spaces.
         data: the batch.
-        out: the batch with what the filter, or its part, wrote.
+        out: the batch with the outputs of the filter, or of its part.
     """
 
     def __init__(self, loss: FilterLoss, data: TensorDictBase, out: TensorDictBase):
         self.loss, self.keys, self.data, self.out = loss, loss.tensor_keys, data, out
 
     def entry(self, key: NestedKey, cure: str = "", *, given: bool = False) -> Tensor:
-        """Returns an entry that the filter wrote, or that is ``given`` in the batch.
+        """Returns an output of the filter, or an entry of the batch with ``given``.
 
         Raises:
             KeyError: if it is missing; the message ends with the ``cure``.
@@ -210,27 +210,27 @@ class Targets:
 
     @cached_property
     def counts(self) -> Tensor:
-        """Marks the elements that the filter stepped to, ``[*B]``."""
+        """Marks the elements that are results of a step, ``[*B]``."""
         return self.loss._counts(self.data)
 
     def state(self, size: int) -> Labels:
-        """Returns the true state as far as it counts, against an estimate of ``size`` components."""
+        """Returns the labels of the true state, for an estimate of ``size`` components."""
         labels = self._labels("state", self.entry(self.keys.state, given=True), size, self.loss.dims)
         return labels.scaled("state_scale", self.loss.state_scale)
 
     def observation(self, target: Tensor, size: int) -> Labels:
-        """Returns true observations ``target``, as far as they count, against readings of ``size`` components."""
+        """Returns the labels of true observations ``target``, for readings of ``size`` components."""
         return self._labels("target", target, size).scaled("observation_scale", self.loss.observation_scale)
 
     def visible(self) -> Labels:
-        """Returns whether the sensor sees, ``[*B, 1]``, where that is known and there is a reading."""
+        """Returns the labels of visibility, ``[*B, 1]``, for elements with a reading."""
         values, mask = self.entry(self.keys.target_visible, given=True), self.out.get(self.loss.reading.observed, None)
         values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
         labels = self._labels("visible", values, 1)
         return labels if mask is None else labels._replace(mask=labels.mask & mask.any(-1, keepdim=True))
 
     def whole_state(self) -> Labels:
-        """Returns the true state for what reads all of it; ``mask`` ``[*B, 1]`` says where that is known.
+        """Returns the true state for models that read all of it; ``mask`` ``[*B, 1]`` marks elements with all of it.
 
         Raises:
             ValueError: if the labels lack dimensions.
@@ -247,14 +247,14 @@ class Targets:
         return labels._replace(mask=labels.mask.all(-1, keepdim=True))
 
     def observed_state(self, observe: Callable[[Tensor], Tensor]) -> Tensor:
-        """Observes the true state by a model; what it makes of NaN is NaN: no label."""
-        # The components of a space are those of tangents: its points are whole.
+        """Applies an observation model to the true state; NaN in the result is no label."""
+        # On a space, dims are components of tangents, and points are complete.
         values, dims = self.entry(self.keys.state, given=True), self.loss.dims if is_flat(self.loss.space) else None
         size = max(self.state_size() or 0, values.shape[-1], 1 + max(dims or [0]))
         return observe(self._known("state", values, size, dims))
 
     def state_size(self) -> int | None:
-        """Returns S, of the belief where there is one, P of a space; ``None`` where nobody says."""
+        """Returns S of the belief, or P of a space; ``None`` if neither is known."""
         filter = self.loss.filter
         if self.loss.space is not None:
             return self.loss.space.point_dim
@@ -265,7 +265,7 @@ class Targets:
     def _labels(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None = None) -> Labels:
         space = {"state": self.loss.space, "target": self.loss.reading_space}.get(name)
         if space is not None and size != space.point_dim:
-            raise ValueError(f"a point of {space} has {space.point_dim} numbers, but what is scored has {size}")
+            raise ValueError(f"a point of {space} has {space.point_dim} components, but the estimate has {size}")
         on: Space = space or Euclidean(size)
         flat = is_flat(space)
         known = self._known(name, values, size, dims if flat else None)
@@ -279,13 +279,13 @@ class Targets:
         return Labels(points if flat else on.normalise(points), mask & counting, dims, space=space)
 
     def _known(self, name: str, values: Tensor, size: int, dims: Sequence[int] | None) -> Tensor:
-        """Returns labels ``[*B, N]`` in the places of their components, ``[*B, size]``, NaN where there is none.
+        """Returns labels ``[*B, N]`` at the indices of their components, ``[*B, size]``, NaN without a label.
 
-        They are of the leading N components; or of ``dims``, in their order, where that is N components of which the
-        last are beyond the first N.
+        They are of the leading N components; or of ``dims``, in their order, if ``dims`` has N components of which the
+        last is not among the first N.
 
         Raises:
-            ValueError: if values or mask have another shape, or ``dims`` names components that there are not.
+            ValueError: if values or mask have another shape, or ``dims`` has components that do not exist.
         """
         keys = self.keys
         key = {"state": keys.state, "target": keys.target_observation, "visible": keys.target_visible}[name]
@@ -297,15 +297,15 @@ class Targets:
             )
         last = given - 1 if dims is None else max(dims)
         if last >= size:
-            what = f"{key!r} is {list(values.shape)}" if dims is None else f"dims={list(dims)} names component {last}"
+            what = f"{key!r} is {list(values.shape)}" if dims is None else f"dims={list(dims)} has component {last}"
             raise ValueError(
-                f"{what}, but what is scored against it has {size} components. Labels are of the leading ones, at most "
+                f"{what}, but the estimate has {size} components. Labels are of the leading ones, at most "
                 f"{size}, or of dims=..., counted from 0"
             )
         if dims is not None and last >= given != len(dims):
             raise ValueError(
-                f"dims={list(dims)} names component {last}, but {key!r} has {given}, from 0, which are taken for the "
-                f"leading ones; pass these, or one for each of dims"
+                f"dims={list(dims)} has component {last}, but {key!r} has {given}, which are used as the leading "
+                f"ones, from 0; pass these, or one for each of dims"
             )
         known = torch.ones_like(values[..., :1], dtype=torch.bool)
         observed_key = getattr(self.keys, f"{name}_observed") or mask_of(key)
@@ -335,7 +335,7 @@ def check_row_mask(key: NestedKey, mask: Tensor, values: Tensor) -> None:
 
 
 def mask_of(key: NestedKey) -> NestedKey:
-    """Returns the mask that data sets write next to an entry.
+    """Returns the key of the mask that data sets store with an entry.
 
     Example:
         >>> mask_of("state"), mask_of(("truth", "x"))
@@ -346,7 +346,7 @@ def mask_of(key: NestedKey) -> NestedKey:
 
 
 def mean_of(values: Tensor, mask: Tensor) -> Tensor:
-    """Returns the mean over the last dimension of what a mask leaves in, ``[*]``; zero of nothing.
+    """Returns the masked mean over the last dimension, ``[*]``; zero if all is masked.
 
     Example:
         >>> mean_of(torch.tensor([1.0, 5.0]), torch.tensor([False, True]))

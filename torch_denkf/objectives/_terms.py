@@ -1,6 +1,6 @@
-"""The terms of the library's losses, and the scores that they are made of: of members, of particles and of a Gaussian.
+"""The terms of the library's losses, and the scores that they use: for members, for particles and for a Gaussian.
 
-Errors are zero where there is no label; a score is of the components that have one.
+Errors are zero without a label; a score is over the components that have one.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from torch_denkf.objectives.filter_loss import FilterLoss, Term
 MEMBER_SCORES = ("crps", "energy", "mse")
 GAUSSIAN_SCORES = ("crps", "nll", "mse")
 
-#: Which objective is for which belief, for messages.
+#: The objective for each kind of belief, for messages.
 BELIEFS = (
-    "DEnKFLoss scores members that count alike, MixtureLoss particles with weights, GaussianLoss a mean and a "
+    "DEnKFLoss scores members of equal weight, MixtureLoss particles with weights, GaussianLoss a mean and a "
     "covariance. "
 )
 
 
 class OfBelief(Term):
-    """A term of a belief, a forecast or a smoothed belief, which stands under the ``key`` of this name."""
+    """A term for a belief, a forecast or a smoothed belief, which is stored under the loss's key named ``key``."""
 
     def __init__(self, name: str, key: str, weight: float = 1.0):
         self.name, self.key = name, key
         super().__init__(weight)
 
     def place(self, truth: Targets) -> NestedKey:
-        """Returns its key."""
+        """Returns the key of the belief."""
         return getattr(truth.keys, self.key)
 
 
 class Members(OfBelief):
-    """The score of members that count alike."""
+    """The score of members of equal weight."""
 
     def forward(self, out, truth):
         filter = truth.loss.filter
         weights = [kind.key("log_weight") for kind in filter.structure.kinds if isinstance(kind, beliefs.Particles)]
         if weights:
             raise TypeError(
-                f"DEnKFLoss scores members that count alike, but those of this {type(filter).__name__} have weights, "
-                f'{weights[0]!r}. Take MixtureLoss, with score="crps" for this one\'s score'
+                f"DEnKFLoss scores members of equal weight, but those of this {type(filter).__name__} have weights, "
+                f'{weights[0]!r}. Use MixtureLoss, with score="crps" for the score of this loss'
             )
         return score_ensemble(truth, truth.entry(self.place(truth), BELIEFS))
 
@@ -84,7 +84,7 @@ class Particles(OfBelief):
         return labels.errors(particles, log_weights.softmax(-1), each=self.each(truth)), log_weights, labels
 
     def each(self, truth: Targets) -> bool:
-        """Tells whether the score has a tangent space at each particle: the width around it is in that."""
+        """Tells whether errors are taken in the tangent space at the truth, as for the mixture's density."""
         return truth.loss.score == "mixture"
 
 
@@ -93,7 +93,7 @@ class Mean(Particles):
 
     def forward(self, out, truth):
         errors, log_weights, labels = self.errors(truth)
-        # The mean of errors, because the mean of angles on both sides of pi is none.
+        # The mean of errors, because angles on both sides of pi have no mean.
         return labels.mean(weighted_mean(errors, log_weights).square()), labels.rows
 
     def each(self, truth):
@@ -109,32 +109,32 @@ class Sensor(Term):
 
     def forward(self, out, truth):
         samples, labels = sensor_samples(truth)
-        # Samples have no density: what scores the state by one scores them by their CRPS.
+        # Samples have no density: for scores of the state by density, samples are scored by their CRPS.
         score = truth.loss.score if truth.loss.score in ("mse", "energy") else "crps"
         return score_members(labels.errors(samples), labels.mask, score), labels.rows
 
     def exists(self, loss: FilterLoss) -> bool:
-        """Returns True if a module writes its samples, or the user has named where they are."""
+        """Returns True if a module writes samples, or the user has set their key."""
         structure = loss.filter.structure
         samples = [*filter(beliefs.is_samples, structure.frame_keys)] or ("sensor", "ensemble") in structure.step_keys
         return loss.tensor_keys.sensor is not None or bool(samples)
 
 
 class Noise(Term):
-    """The negative log-likelihood of the true observation under the samples' mean and R."""
+    """The negative log-likelihood of the true observation, given the samples' mean and R."""
 
     name = "noise"
     of_frames = True
 
     def forward(self, out, truth):
         samples, labels = sensor_samples(truth)
-        noise = truth.entry(truth.keys.noise or truth.loss.reading.noise, "R must follow from frames alone. ")
+        noise = truth.entry(truth.keys.noise or truth.loss.reading.noise, "R must be computed from frames only. ")
         error = labels.errors(samples).mean(-2)
         return score_gaussian(error, labels.mask, as_covariance(noise, error), "nll", labels.scale), labels.rows
 
 
 class Visible(Term):
-    """The binary cross entropy of whether the sensor sees."""
+    """The binary cross entropy of the sensor's visibility."""
 
     name = "visible"
     of_frames = True
@@ -148,7 +148,7 @@ class Visible(Term):
 
 
 class Observation(Term):
-    """The squared error of what the observation model reads of the true state."""
+    """The squared error of the observation model at the true state."""
 
     name = "observation"
     of_frames = True
@@ -157,8 +157,8 @@ class Observation(Term):
         model = truth.loss.reading.model
         if model is None:
             raise KeyError(
-                "loss_observation is of a model with an observe() method, and the filter has no observation model with "
-                "one, or one for each of several sensors: name one, set_keys(sensor=NAME). Or set the weight "
+                "loss_observation is for a model with an observe() method, and the filter has no observation model "
+                "with one, or one for each of several sensors: select one, set_keys(sensor=NAME). Or set the weight "
                 "observation=0."
             )
         state = truth.whole_state()
@@ -176,7 +176,7 @@ class Likelihood(Term):
 
     def forward(self, out, truth):
         key = truth.keys.log_likelihood
-        # Of several analyses, each with its own readings, the likelihoods multiply.
+        # The likelihoods of several analyses, each with its own readings, are multiplied.
         keys = truth.loss.filter.structure.likelihoods if key == truth.loss.default_keys.log_likelihood else []
         first, *others = [truth.entry(key) for key in keys or [key]]
         return -sum(others, first).squeeze(-1), None
@@ -194,14 +194,14 @@ class Divergence(Term):
 
 
 def score_members(errors: Tensor, mask: Tensor, score: str) -> Tensor:
-    """Scores members that are off by ``errors``.
+    """Scores members by their ``errors``.
 
-    One member is a point, and the CRPS of a point is its absolute error; the energy score is the length of its error.
-    The fair scores of more members need pairs of them.
+    One member is a point: the CRPS is its absolute error, the energy score the length of its error.
+    Fair scores need at least two members.
 
     Args:
         errors: ``[*, E, N]``, in the units of the score.
-        mask: which components have a label, ``[*, N]``.
+        mask: components with a label, ``[*, N]``.
         score: ``"crps"``, fair, in each dimension, averaged; ``"energy"``, fair, of all dimensions together; ``"mse"``,
             the squared error of the mean.
 
@@ -225,11 +225,11 @@ def score_members(errors: Tensor, mask: Tensor, score: str) -> Tensor:
 def score_mixture(
     errors: Tensor, mask: Tensor, log_weights: Tensor, score: str, std: Tensor, scale: Tensor | None
 ) -> Tensor:
-    """Scores weighted particles that are off by ``errors``.
+    """Scores weighted particles by their ``errors``.
 
     Args:
         errors: ``[*, E, N]``, divided by ``scale``.
-        mask: which components have a label, ``[*, N]``.
+        mask: components with a label, ``[*, N]``.
         log_weights: ``[*, E]``.
         score: ``"mixture"``, the negative log-density of all dimensions together in their own units, with a Gaussian
             around each particle; ``"crps"`` with weights, in each dimension, averaged.
@@ -241,7 +241,7 @@ def score_mixture(
     """
     if score == "crps":
         return mean_of(crps_ensemble(errors, torch.zeros_like(errors[..., 0, :]), log_weights), mask)
-    # In the state's own units the density is one of the scaled state, divided by all scales.
+    # The density of the unscaled state is the density of the scaled state, divided by all scales.
     width = std if scale is None else std * scale
     constant = torch.where(mask, width.log() + 0.5 * math.log(2 * math.pi), 0).sum(-1)
     log_density = log_weights - 0.5 * (errors / std).square().sum(-1)
@@ -249,11 +249,11 @@ def score_mixture(
 
 
 def score_gaussian(errors: Tensor, mask: Tensor, cov: Tensor, score: str, scale: Tensor | None = None) -> Tensor:
-    """Scores a Gaussian whose mean is off by ``errors``.
+    """Scores a Gaussian by the ``errors`` of its mean.
 
     Args:
         errors: ``[*, N]``, divided by ``scale``.
-        mask: which components have a label, ``[*, N]``.
+        mask: components with a label, ``[*, N]``.
         cov: ``[*, N, N]``, in its own units.
         score: ``"crps"`` in each dimension, averaged; ``"nll"``, the negative log-density of all dimensions together,
             in nats, in their own units; ``"mse"`` of the mean.
@@ -272,31 +272,31 @@ def score_gaussian(errors: Tensor, mask: Tensor, cov: Tensor, score: str, scale:
         cov = cov / scale.unsqueeze(-1) / scale
     zero = torch.zeros_like(errors)
     if score == "nll":
-        # Components without a label are made independent and standard normal; their density at zero is taken out
-        # again. It is a density of the unscaled errors: the scale only conditions the arithmetic.
+        # Components without a label are made independent and standard normal; their density at zero is subtracted
+        # again. The result is a density of the unscaled errors: the scale only conditions the arithmetic.
         identity = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
         cov = torch.where(mask.unsqueeze(-1) & mask.unsqueeze(-2), cov, identity)
         units = zero if scale is None else scale.log().expand_as(errors)
         added = torch.where(mask, units, -0.5 * math.log(2 * math.pi))
         return added.sum(-1) - gaussian_log_prob(errors, zero, cov)
-    # Without spread the CRPS is the absolute error; a spread of 1e-6 is as good as none, and has a derivative.
+    # Without spread the CRPS is the absolute error; a spread of 1e-6 is nearly zero, and has a derivative.
     return mean_of(crps_gaussian(zero, cov.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12), errors), mask)
 
 
 def score_ensemble(truth: Targets, ensemble: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the loss's score of members ``[*B, E, S]`` against the true state, and which elements have one."""
+    """Scores members ``[*B, E, S]`` against the true state; also returns the label mask."""
     labels = truth.state(ensemble.shape[-1])
     return score_members(labels.errors(ensemble), labels.mask, truth.loss.score), labels.rows
 
 
 def score_moments(truth: Targets, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
-    """Scores a mean ``[*B, S]`` and a covariance ``[*B, S, S]`` against the true state, and marks what has one."""
+    """Scores a mean ``[*B, S]`` and a covariance ``[*B, S, S]`` against the true state; also returns the label mask."""
     labels = truth.state(mean.shape[-1])
     return score_gaussian(labels.errors(mean), labels.mask, cov, truth.loss.score, labels.scale), labels.rows
 
 
 def sensor_samples(truth: Targets) -> tuple[Tensor, Labels]:
-    """Returns the sensor's samples ``[*B, E, O]``, and what they should be where it observed all.
+    """Returns the sensor's samples ``[*B, E, O]``, and their labels in observed rows.
 
     Raises:
         KeyError: if there are no samples, or no true observation.
@@ -306,17 +306,17 @@ def sensor_samples(truth: Targets) -> tuple[Tensor, Labels]:
     if target is None:
         if model is None or learns(model):
             named = sorted({key[1] for key in filter.structure.frame_keys if beliefs.is_samples(key) and key[2:]})
-            several = "has no observation model with an observe() method, or several sensors, of which none is named"
+            several = "has no observation model with an observe() method, or several sensors, of which none is selected"
             several += f" (there are {named})" * bool(named)
             why = several if model is None else "learns its observation model"
             raise KeyError(
                 f"loss_sensor needs the true observation in {keys.target_observation!r}, because the filter {why}. Add "
-                "the entry, or rename it with set_keys(target_observation=...); name a sensor, set_keys(sensor=...); "
+                "the entry, or rename it with set_keys(target_observation=...); select a sensor, set_keys(sensor=...); "
                 "or set the weight sensor=0.0."
             )
         target = truth.observed_state(model.observe)
     written = [key for key in (*filter.structure.frame_keys, *filter.structure.step_keys) if beliefs.is_samples(key)]
-    cure = f"The filter writes the samples {written}: name one of several sensors, or set the weight sensor=0.0. "
+    cure = f"The filter writes the samples {written}: select one of several sensors, or set the weight sensor=0.0. "
     samples = truth.entry(reading.samples, "" if reading.samples in written else cure)
     if samples.ndim == data.ndim + 1:
         samples = samples.unsqueeze(-2)

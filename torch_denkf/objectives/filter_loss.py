@@ -1,4 +1,4 @@
-"""The one loss of filters, and what its terms are: it runs a filter once over a batch, and returns weighted terms."""
+"""The base class of all losses, and of their terms: it runs a filter once over a batch, and returns weighted terms."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from torch_denkf.objectives._labels import Keys, Reading, Targets
 __all__ = ["FilterLoss", "ReadingsOptions", "Scale", "SequenceKeys", "SequenceOptions", "StateOptions", "Term"]
 
 
-#: A scale of each dimension; infinite where the dimension does not count.
+#: A scale of each dimension; infinite for a dimension that is not scored.
 Scale = Sequence[float] | Tensor | None
 
 
 class ReadingsOptions(TypedDict, total=False):
-    """Declares the options of every loss that scores readings.
+    """Options of every loss that scores readings.
 
-    Labels, true states and true observations, may have gaps. A mask of labels, which is named like them with
-    ``_observed`` behind (``"state_observed"``; ``[*B, 1]``, or one for each dimension), says where there are some, and
-    NaN is none. A gap has no value and no gradient: a score is of the dimensions that have a label, and means are over
-    the elements that have one. Of a batch without any the loss is zero.
+    Labels, true states and true observations, may have gaps: NaN, and elements that a mask of labels marks as missing.
+    The mask is named like the labels with ``_observed`` appended (``"state_observed"``; ``[*B, 1]``, or one value for
+    each dimension). A gap has no value and no gradient: a score is over the dimensions that have a label, and means
+    are over the elements that have one. For a batch without labels the loss is zero.
 
     Attributes:
         observation_scale: ``[O]``; errors of observations are divided by it, so that dimensions with different units
-            count alike. A dimension with infinite scale does not count: means are taken over the others. A term that
+            have equal weight. A dimension with infinite scale is not scored: means are over the others. A term that
             is a likelihood stays a density in the observation's own units.
-        reading_space: in which observations live, one of numbers and angles such as ``Euclidean(1) * Circle()``; errors
+        reading_space: space of observations, made of numbers and angles, such as ``Euclidean(1) * Circle()``; errors
             of angles are wrapped to [-pi, pi). ``None`` for plain numbers.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``: the shape of the batch, zero where an element does
-            not count.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``: the shape of the batch, zero for elements that are
+            not scored.
     """
 
     observation_scale: Scale
@@ -51,22 +51,22 @@ class ReadingsOptions(TypedDict, total=False):
 
 
 class StateOptions(TypedDict, total=False):
-    """Declares the options of every loss that scores the state.
+    """Options of every loss that scores the state.
 
     The true state may have fewer dimensions than the belief: its labels are of the leading ones, or of ``dims``.
 
     Attributes:
-        dims: state dimensions that count; all that have labels by default. Labels are of the leading dimensions; or of
-            ``dims`` alone, in their order, where some of these lie beyond as many leading ones.
+        dims: scored state dimensions; all that have labels by default. N labels are of the leading N dimensions; or of
+            ``dims``, in their order, if ``dims`` has N dimensions of which one is beyond the leading N.
         state_scale: one for each of ``dims``, else of the labels' dimensions; errors of the state are divided by it. A
-            dimension with infinite scale does not count.
-        space: the space whose points the states are, such as ``Product(SO3(), Euclidean(3))``, or
+            dimension with infinite scale is not scored.
+        space: the space of the states, such as ``Product(SO3(), Euclidean(3))``, or
             ``Flat(5, circular=[2])`` for numbers of which one is an angle, whose errors are wrapped to [-pi, pi). By
-            default it is that of the filter's initial belief. Errors are then tangents ``[D]``, whose components
-            ``dims`` and ``state_scale`` count; the belief's covariance is one of tangents at its mean. A part of the
-            space has a label where all of its numbers have. Scores of members compare tangents at the members' mean,
-            which makes them proper; a Gaussian's density is that of the tangent from its mean to the truth, in the
-            units of tangents.
+            default it is that of the filter's initial belief. Errors are then tangents ``[D]``, to whose components
+            ``dims`` and ``state_scale`` refer; the belief's covariance is of tangents at its mean. A part of the
+            space has a label if all of its components have one. Scores of members compare tangents at the members'
+            mean, which makes them proper; a Gaussian's density is that of the tangent from its mean to the truth, in
+            the units of tangents.
     """
 
     dims: Sequence[int] | None
@@ -75,7 +75,7 @@ class StateOptions(TypedDict, total=False):
 
 
 class SequenceOptions(ReadingsOptions, StateOptions, total=False):
-    """Declares the options of losses of a whole filter, next to :class:`ReadingsOptions` and :class:`StateOptions`.
+    """Options of losses of a whole filter, in addition to :class:`ReadingsOptions` and :class:`StateOptions`.
 
     Attributes:
         detach_every: truncated back-propagation: steps after which the belief is detached.
@@ -85,18 +85,18 @@ class SequenceOptions(ReadingsOptions, StateOptions, total=False):
 
 
 class Term(nn.Module):
-    """A term of a loss, ``loss_<name>``; a subclass writes :meth:`forward`.
+    """A term of a loss, ``loss_<name>``; a subclass implements :meth:`forward`.
 
     A term may have parameters and buffers of its own: they are the loss's, too.
 
     Args:
-        weight: its weight; zero for a term that is neither computed nor returned, ``None`` for 1 where :meth:`exists`
-            finds what it scores, else 0.
+        weight: its weight; zero for a term that is neither computed nor returned. ``None`` is 1 if :meth:`exists`
+            finds anything to score, else 0.
 
     Attributes:
         name: its name, after ``loss_``.
-        of_frames: whether it counts in all elements that have what it scores, and not only in those that the filter
-            stepped to.
+        of_frames: whether all elements that have its labels are scored, and not only those that are results of a
+            step.
         needs_state: whether it needs the true state.
 
     Example:
@@ -130,28 +130,28 @@ class Term(nn.Module):
         """Returns the term's value in each element.
 
         Args:
-            out: the batch ``[*B]`` with what the filter wrote.
-            truth: the labels: ``truth.state(S)`` and ``truth.observation(target, O)`` give true values, where they are
-                known, and errors with the loss's scales and spaces.
+            out: the batch ``[*B]`` with the outputs of the filter.
+            truth: the labels: ``truth.state(S)`` and ``truth.observation(target, O)`` return known true values, and
+                errors with the loss's scales and spaces.
 
         Returns:
-            Its values ``[*B]``, or one number; and which elements have what it scores, ``[*B]`` bool (``None``: all).
+            Its values ``[*B]``, or one number; and a mask of the scored elements, ``[*B]`` bool (``None``: all).
         """
         raise NotImplementedError
 
     def exists(self, loss: FilterLoss) -> bool:
-        """Tells whether there is what the term scores, for a weight of ``None``."""
+        """Tells whether the term has anything to score, for a weight of ``None``."""
         return True
 
 
 @dataclass
 class SequenceKeys(Keys):
-    """The entries that losses of whole filters read besides those of all losses.
+    """The input keys of losses of whole filters, in addition to those of all losses.
 
     Attributes:
         belief: prefix of the belief's entries: ``mean`` and ``cov``, or ``ensemble`` and ``log_weight``.
-        forecast: prefix of the forecast's entries, of the same names.
-        log_likelihood: that of the innovation, or of the reading.
+        forecast: prefix of the forecast's entries, with the same names.
+        log_likelihood: key of the log-likelihood of the innovation, or of the reading.
     """
 
     belief: NestedKey = "belief"
@@ -162,23 +162,23 @@ class SequenceKeys(Keys):
 class FilterLoss(Checked, LossModule):
     """Runs a filter once over sequences ``[*B, T]``, and returns weighted terms: ``loss_<name>`` for each.
 
-    The other losses are this one with terms of their own. Terms with weight zero are neither computed nor returned; the
-    others are returned with their weight applied, so that their sum is the objective. Those elements count that were
-    stepped to; the first of a sequence and those with ``is_init`` hold an initial belief. A mask of padding in the
-    data, such as ``("collector", "mask")``, leaves elements out of every term. Slices in a flat ``[N]``, as torchrl's
-    ``SliceSampler`` returns them, must be marked.
+    The other losses add their own terms to this one. Terms with weight zero are neither computed nor returned; the
+    others are returned with their weight applied, so that their sum is the objective. Only elements that are results
+    of a step are scored; the first of a sequence and those with ``is_init`` have an initial belief. A mask of padding
+    in the data, such as ``("collector", "mask")``, leaves elements out of every term. Slices in a flat ``[N]``, as
+    torchrl's ``SliceSampler`` returns them, must be marked.
 
     Args:
         filter: the filter; its parameters are the loss's.
-        terms: what is scored, see :class:`Term`.
-        score: one of the class's ``SCORES``, where it has some.
+        terms: the terms, see :class:`Term`.
+        score: one of the class's ``SCORES``, if it has any.
         **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
             :class:`SequenceOptions`.
 
     Raises:
-        TypeError: for what is no filter, no term or no space.
+        TypeError: if an argument is no filter, no term or no space.
         ValueError: on an unknown score, two terms of one name, a scale that is not positive, infinite in all
-            dimensions, or of another length than what is scored, a space of another size than what is scored, a
+            dimensions, or of another length than the scored dimensions, a space of another size, a
             ``reading_space`` of another kind, labels of another shape, or slices that are not marked.
 
     Example:
@@ -213,11 +213,11 @@ class FilterLoss(Checked, LossModule):
         if dims is not None:
             check_dims("dims", dims, once=True)
             if not len(dims):
-                raise ValueError("dims names the dimensions of the state that count; got none. Pass None for all.")
+                raise ValueError("dims must have at least one dimension of the state; got none. Pass None for all.")
         space = check_space("space", filter.structure.space if options.get("space") is None else options["space"])
         if space is not None and dims is not None and max(dims) >= space.tangent_dim:
             raise ValueError(
-                f"dims={list(dims)} names component {max(dims)} of tangents of {space.tangent_dim}, from 0."
+                f"dims={list(dims)} has component {max(dims)}, but tangents have {space.tangent_dim}, from 0."
             )
         super().__init__()
         self.space, self.reading_space = space, check_space("reading_space", options.get("reading_space"), flat=True)
@@ -232,30 +232,30 @@ class FilterLoss(Checked, LossModule):
         self._choose_terms()
 
     def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
-        """Keeps a constant, on the filter's device."""
+        """Registers a constant on the filter's device."""
         like = self.filter.like()
         super().register_buffer(name, tensor if tensor is None or like is None else tensor.to(like.device), persistent)
 
     def _check_entries(self, name: str, value: Tensor) -> None:
-        """Raises a ``ValueError`` unless a value has one entry for each of ``dims``, where these are given."""
+        """Raises a ``ValueError`` unless a value has one entry for each of ``dims``, if these are given."""
         if self.dims is not None and value.numel() != len(self.dims):
             raise ValueError(f"{name} has one entry for each of dims={self.dims}; got {value.numel()}.")
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Lists the keys that must be there."""
+        """Lists the required keys."""
         return self._needed()
 
     @in_keys.setter
     def in_keys(self, value) -> None:
-        raise AttributeError("in_keys follow from the filter; rename the state with set_keys(state=...).")
+        raise AttributeError("in_keys are determined by the filter; rename the state with set_keys(state=...).")
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
-        """Names entries otherwise, see the class's ``_AcceptedKeys``; ``None`` for the default.
+        """Sets the keys of input entries, see the class's ``_AcceptedKeys``; ``None`` for the default.
 
         Raises:
-            TypeError: for what is no key: a string, or a tuple of strings.
-            ValueError: for entries that the loss does not read.
+            TypeError: if a key is neither a string nor a tuple of strings.
+            ValueError: if the loss has no such entry.
         """
         known = [field.name for field in fields(self._AcceptedKeys)]
         for name, key in kwargs.items():
@@ -273,7 +273,7 @@ class FilterLoss(Checked, LossModule):
         self.out_keys = [f"loss_{name}" for name in self.weights]
 
     def named_parameters(self, prefix: str = "", recurse: bool = True) -> Iterator[tuple[str, nn.Parameter]]:
-        """Returns the parameters that are trained, with their names in the loss."""
+        """Returns the trained parameters, with their names in the loss."""
         found, parts = super().named_parameters(prefix, recurse), self._trained()
         if parts is None:
             return found
@@ -282,7 +282,7 @@ class FilterLoss(Checked, LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the weighted terms; ``tensordict`` is left as it is."""
+        """Returns the weighted terms; ``tensordict`` is not changed."""
         out = self._run(tensordict)
         truth, losses = Targets(self, tensordict, out), TensorDict({}, batch_size=[])
         for term in self.terms:
@@ -298,10 +298,10 @@ class FilterLoss(Checked, LossModule):
             losses[f"loss_{term.name}"] = self.weights[term.name] * value
         return losses
 
-    # ------------------------------------------------------------------------ what a loss of a part has otherwise
+    # --------------------------------------------------------------------------- overridden by losses of a part
 
     def _run(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the batch with what the filter, or its part, writes."""
+        """Returns the batch with the outputs of the filter, or of its part."""
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         return self.filter.inside(self._filters().sequence(tensordict.copy(), detach_every=self.detach_every))
 
@@ -310,11 +310,11 @@ class FilterLoss(Checked, LossModule):
         return self.filter
 
     def _counts(self, tensordict: TensorDictBase) -> Tensor:
-        """Marks the elements that a step led to, ``[*B]``."""
+        """Marks the elements that are results of a step, ``[*B]``."""
         return self.filter.stepped(tensordict)
 
     def _needed(self) -> list[NestedKey]:
-        """Lists the inputs of the filter next to its belief, and the true state."""
+        """Lists the inputs of the filter in addition to its belief, and the true state."""
         structure = self.filter.structure
         needed = [*structure.needed, *structure.controls]
         supervised = any(term.needs_state for term in self.terms if term.name in self.weights)
@@ -322,9 +322,10 @@ class FilterLoss(Checked, LossModule):
         return [*needed, self.tensor_keys.state] if supervised else needed
 
     def _trained(self) -> Iterable[nn.Module] | None:
-        """Returns the modules of the part that is trained; ``None`` for all.
+        """Returns the trained modules; ``None`` for all.
 
-        The whole filter is kept, so that it follows the loss to another device, and its names stay in the state dict.
+        The whole filter is registered, so that it moves with the loss to another device, and its names stay in the
+        state dict.
         """
         return None
 
@@ -334,9 +335,9 @@ def _checked_scale(name: str, scale: Scale) -> Tensor | None:
         return None
     scale = as_floating(scale, name)
     if scale.ndim > 1:
-        raise ValueError(f"{name} is one number a dimension; got {list(scale.shape)}.")
+        raise ValueError(f"{name} is one number per dimension; got {list(scale.shape)}.")
     if not ((scale > 0).all() and scale.isfinite().any()):
-        raise ValueError(f"{name} is positive, and infinite where a dimension does not count; one must. Got {scale}.")
+        raise ValueError(f"{name} must be positive; infinite leaves a dimension out, but not all. Got {scale}.")
     return scale
 
 
@@ -344,7 +345,7 @@ def _checked_terms(terms: Sequence[Term]) -> list[Term]:
     names = set()
     for term in terms:
         if not isinstance(term, Term):
-            raise TypeError(f"terms are objects of classes made of torch_denkf's Term; got {term!r}"[:200])
+            raise TypeError(f"terms must be instances of sub-classes of torch_denkf's Term; got {term!r}"[:200])
         if term.name in names:
             raise ValueError(f"Two terms are called {term.name!r}; give one of them another name.")
         names.add(term.name)

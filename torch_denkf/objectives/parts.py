@@ -1,4 +1,4 @@
-"""Training objectives of one part of a filter: they train that part, and nothing else."""
+"""Training objectives for one part of a filter, which train only that part."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ __all__ = ["ObservationLoss", "SensorLoss", "TransitionLoss"]
 
 
 class ObservationLoss(FilterLoss):
-    r"""Scores what a filter's observation model reads of true states, ``[*B]``.
+    r"""Scores a filter's observation model on true states, ``[*B]``.
 
-    Its term ``loss_observation`` is the squared error of :math:`h_\psi(x_t)` against the true observation, the term of
-    that name in :class:`~torch_denkf.objectives.DEnKFLoss`. The parameters of the loss are those of the model.
+    Its term ``loss_observation`` is the squared error of :math:`h_\psi(x_t)` against the true observation, as
+    in :class:`~torch_denkf.objectives.DEnKFLoss`. The parameters of the loss are those of the model.
 
     Args:
         filter: the filter whose observation model is trained; a module with an ``observe()`` method.
@@ -74,30 +74,30 @@ class ObservationLoss(FilterLoss):
 
 
 class SensorLoss(FilterLoss):
-    r"""Scores what a filter's sensor reads, without the filter, on any batch of frames ``[*B]``. Of two or
-    more dimensions the last is time, for modules that tell times apart.
+    r"""Scores the readings of a filter's sensor, without the filter, on any batch of frames ``[*B]``. With two or
+    more dimensions the last is time, for modules that distinguish times.
 
-    Those modules are run that read frames alone and lead to what is scored: the sensor, and with ``noise`` its noise
-    model. Other sensors of the filter, and their readings, need not be there.
+    It runs only modules that read frames and are needed for the score: the sensor, and with ``noise`` its noise
+    model. Other sensors of the filter, and their readings, may be missing.
 
     ========================  =====================================================================================
-    ``loss_sensor``           score of the sensor's samples against the true observation, the term of that name in
+    ``loss_sensor``           score of the sensor's samples against the true observation, as in
                               :class:`~torch_denkf.objectives.DEnKFLoss`
     ``loss_noise``            negative log-likelihood of the true observation under N(mean of the samples, R), nats
-    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+    ``loss_visible``          binary cross entropy of the sensor's visibility, for a filter with a
                               :class:`~torch_denkf.imperfect.Visibility`
     ========================  =====================================================================================
 
-    Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Frames
-    count where the sensor observed all and the true observation is known, see :class:`ReadingsOptions`. The parameters
-    of the loss are those of the modules it runs.
+    Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. A frame
+    is scored if the sensor observed all of it and the true observation is known, see :class:`ReadingsOptions`. The
+    parameters of the loss are those of the modules it runs.
 
     Args:
         filter: the filter whose sensor is trained.
-        score: of the samples: ``"crps"`` (fair), ``"energy"`` (fair) or ``"mse"`` (of the mean). Of one sample the
-            first two are its absolute error, and the length of its error: the scores of a point.
+        score: score of the samples: ``"crps"`` (fair), ``"energy"`` (fair) or ``"mse"`` (of the mean). For one sample
+            the first two are its absolute error, and the length of its error: the scores of a point.
         sensor: weight of ``loss_sensor``.
-        noise: weight of ``loss_noise``. R must follow from frames alone.
+        noise: weight of ``loss_noise``. R must be computed from frames only.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         **options: ``observation_scale``, ``reading_space`` and ``reduction``, see :class:`ReadingsOptions`.
 
@@ -117,17 +117,17 @@ class SensorLoss(FilterLoss):
 
     @dataclass
     class _AcceptedKeys(Keys):
-        """The entries that the loss reads.
+        """The input keys of the loss.
 
         Attributes:
-            state: true state ``[*B, S]``, read where there is no true observation.
-            state_observed: where it is known, ``[*B, 1]`` or ``[*B, S]``.
-            target_observation: true observation ``[*B, O]``; where it is missing and the filter's observation model has
-                no parameters, it is that model's observation of the true state.
-            target_observed: where it is known, ``[*B, 1]`` or ``[*B, O]``.
+            state: true state ``[*B, S]``, read if there is no true observation.
+            state_observed: mask of its known components, ``[*B, 1]`` or ``[*B, S]``.
+            target_observation: true observation ``[*B, O]``; if it is missing and the filter's observation model has
+                no parameters, that model's observation of the true state is used.
+            target_observed: mask of its known components, ``[*B, 1]`` or ``[*B, O]``.
             observed: mask of the reading, ``[*B, 1]`` or ``[*B, O]``; by default that of the sensor's update.
-            sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one sensor of several;
-                by default those that the filter's one sensor writes.
+            sensor: the sensor's samples ``[*B, E, O]`` or readings ``[*B, O]``, or the name of one of several sensors;
+                by default the output of the filter's only sensor.
             noise: R, variances ``[*B, O]`` or a covariance ``[*B, O, O]``; by default that of the sensor's update.
         """
 
@@ -153,7 +153,7 @@ class SensorLoss(FilterLoss):
         return [module for _, module in self._placed()]
 
     def _placed(self):
-        """Returns the modules that read frames alone and lead to the score: the sensor; R and a head where they are."""
+        """Returns the modules that read only frames and are needed for the score: the sensor; R and a head, if any."""
         keys, reading, placed = self.tensor_keys, self.reading, []
         wanted = {reading.samples, reading.observed}
         wanted |= {unravel_key(keys.noise or reading.noise)} if "noise" in self.weights else set()
@@ -165,7 +165,7 @@ class SensorLoss(FilterLoss):
         return placed[::-1]
 
     def _needed(self):
-        """Lists the inputs of the modules, and the true observation, or the state that it follows from."""
+        """Lists the inputs of the modules, and the true observation, or the state from which it is computed."""
         keys, model = self.tensor_keys, self.reading.model
         unknown = model is None or _terms.learns(model)
         needed = list(reads_of(self._trained())[0])
@@ -190,23 +190,23 @@ class SensorLoss(FilterLoss):
 class TransitionLoss(FilterLoss):
     r"""Scores the forecast of one step from the true state at t-1 against the true state at t, on ``[*B, T]``.
 
-    Nothing is filtered: all steps are made at once, each from the truth. The members of an ensemble filter are all at
-    the truth, or around it by ``spread``; the transition's own noise makes them differ. A filter with a mean and a
-    covariance starts from N(truth, spread²). The one term is ``loss_transition``. The first element of a sequence, and
-    those where an episode begins, do not count. Nor do those with gaps in their labels: a step starts where all of the
-    state is known, and is scored against what is known one step later, see :class:`ReadingsOptions`. The parameters of
-    the loss are those of the transition.
+    Nothing is filtered: all steps run at once, each from the truth. The members of an ensemble filter start at the
+    truth, or around it by ``spread``; the transition's own noise makes them differ. A filter with a mean and a
+    covariance starts from N(truth, spread²). The only term is ``loss_transition``. The first element of a sequence or
+    of an episode is not scored. Neither are elements with gaps in their labels: a step starts where all of the state
+    is known, and is scored against the known components one step later, see :class:`ReadingsOptions`. The parameters
+    of the loss are those of the transition.
 
     Args:
         filter: the filter whose transition is trained.
         score: ``"crps"``, ``"energy"`` or ``"mse"`` of members, as in :class:`~torch_denkf.objectives.DEnKFLoss`;
             ``"crps"``, ``"nll"`` or ``"mse"`` of a Gaussian, as in :class:`~torch_denkf.objectives.GaussianLoss`. A
-            transition without noise has no spread but ``spread``: teach it by ``"mse"``.
-        spread: standard deviation around the truth, in the state's units: a number or ``[S]``, of a space of tangents
-            ``[D]``. Members are drawn again in each call.
-        members: E; by default as many as the initial belief has. One is a point, for ``"mse"`` alone.
+            transition without noise has only the spread ``spread``: train it by ``"mse"``.
+        spread: standard deviation around the truth, in the state's units: one number or ``[S]``, on a space
+            ``[D]`` for tangents. Members are drawn again in each call.
+        members: E; by default the number of the initial belief. One member is a point, only for ``"mse"``.
         belief: prefix of the carried ``ensemble``, or of ``mean`` and ``cov``.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero where an element does not count).
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``[*B, T]``, zero for elements that are not scored).
         **options: ``dims``, ``state_scale`` and ``space``, see :class:`StateOptions`.
 
     Raises:
@@ -244,7 +244,7 @@ class TransitionLoss(FilterLoss):
         self.SCORES = _terms.GAUSSIAN_SCORES if found is None else _terms.MEMBER_SCORES
         if members is not None:
             check_count(
-                "members", members, least=1 if score == "mse" else 2, cure='One member has no spread: score it by "mse"'
+                "members", members, least=1 if score == "mse" else 2, cure='One member has no spread: use score="mse"'
             )
         super().__init__(filter, [Step()], score=score, reduction=reduction, **options)
         self.belief, self.members = belief, found
@@ -255,7 +255,7 @@ class TransitionLoss(FilterLoss):
         return [self.filter.transition_module]
 
     def _needed(self):
-        """Lists the inputs of the transition next to the belief, and the true state."""
+        """Lists the inputs of the transition in addition to the belief, and the true state."""
         structure = self.filter.structure
         needed = [*structure.needed, *structure.controls]
         read = reads(self.filter.transition_module)[0]
@@ -268,14 +268,15 @@ class TransitionLoss(FilterLoss):
             raise ValueError("A step needs two times, the last batch dimension; this tensordict has batch_size [].")
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         truth = Targets(self, tensordict, tensordict).whole_state().values
-        # Whatever else reads the true state finds no NaN either.
+        # So that other modules that read the true state get no NaN.
         known = tensordict.copy().set(self.tensor_keys.state, truth)
         around = {"spread": self.spread, "members": self.members, "space": self.space}
         written = forecasts_from_truth(self.filter, known, truth, self.belief, **around)
         return TensorDict(written, tensordict.batch_size)
 
     def _counts(self, tensordict):
-        # Without a stored belief, which would let the first element of a slice count: its truth before is unknown.
+        # Without a stored belief, for which the first element of a slice would be scored, although the truth before it
+        # is unknown.
         stepped = self.filter.stepped(tensordict.exclude("previous"))
         known = Targets(self, tensordict, tensordict).whole_state().rows
         return stepped & one_earlier(known, tensordict.ndim - 1)
@@ -294,24 +295,22 @@ class Step(Term):
 
 
 def members_of(filter: Filter, belief: str, members: int | None) -> int | None:
-    """Returns E, as asked for or of the initial belief; ``None`` for a filter with a mean and a covariance.
+    """Returns E, as given or of the initial belief; ``None`` for a filter with a mean and a covariance.
 
     Raises:
-        ValueError: if the filter carries neither below the prefix ``belief``, or nobody says how many.
+        ValueError: if the filter carries neither under the prefix ``belief``, or E is not known.
     """
     carry = filter.structure.carry
     if (belief, "ensemble") not in carry:
         if not {(belief, "mean"), (belief, "cov")} <= set(carry):
             raise ValueError(
                 f"A step from a true state needs {(belief, 'ensemble')}, or {(belief, 'mean')} and {(belief, 'cov')}; "
-                f"the filter carries {list(carry)}. Name the prefix of its belief, belief=..."
+                f"the filter carries {list(carry)}. Pass the prefix of its belief, belief=..."
             )
         return None
     members = role(filter.initial, Initial).ensemble_size if members is None else members
     if members is None:
-        raise ValueError(
-            f"{type(filter.initial).__name__} does not say how many members the belief has; pass members=..."
-        )
+        raise ValueError(f"{type(filter.initial).__name__} does not declare the number of members; pass members=...")
     return members
 
 
@@ -327,26 +326,26 @@ def forecasts_from_truth(
 ) -> Entries:
     """Forecasts every time of ``[*B, T]`` from the true state before.
 
-    What else the belief carries is read where it is stored, and taken from the initial belief of that time where not.
+    Other carried entries are read if they are stored, and else are those of the initial belief of that time.
 
     Args:
         filter: the filter.
-        tensordict: actions, which are read one step earlier, and what else the transition reads.
-        truth: ``[*B, T, S]``; that of the first time stands for the one before it, too.
+        tensordict: actions, which are read one step earlier, and other inputs of the transition.
+        truth: ``[*B, T, S]``; the first also stands for the time before it.
         belief: prefix of the belief.
         spread: standard deviation of members around the truth, or of the Gaussian, ``[S]`` or one number.
         members: E.
-        space: whose points the states are; ``None`` for plain numbers.
+        space: space of the states; ``None`` for plain numbers.
 
     Returns:
-        What it writes, by the names of the belief: ``(belief, "ensemble")`` and so on.
+        The forecast, by the names of the belief: ``(belief, "ensemble")`` and so on.
     """
     structure, size = filter.structure, tensordict.batch_size
     place, transition = structure.transition
     time, call = len(size) - 1, Call(size, time=True)
     entries = filter.entries_of(tensordict)
     if any(key in structure.frame_keys for keys in reads(transition) for key in keys):
-        with torch.no_grad():  # these parts are not the ones that are trained
+        with torch.no_grad():  # these parts are not trained
             entries.update(run_modules(structure.frames, entries, call))
     carried = _belief_at(truth, belief, spread, members, space)
     others = [key for key in structure.carry if key not in carried and key not in entries]

@@ -1,4 +1,4 @@
-"""Training objectives of whole filters on sequences: of ensembles, of moments and of weighted particles."""
+"""Training objectives of whole filters on sequences: for ensembles, for moments and for weighted particles."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ __all__ = ["DEnKFLoss", "GaussianLoss", "MixtureLoss"]
 class DEnKFLoss(FilterLoss):
     r"""Scores a filter on sequences ``[*B, T]`` against the true states.
 
-    The default score of an ensemble is the fair CRPS, a proper score: it teaches the mean *and* the spread. The
-    paper's loss, the squared error of the mean, says nothing about the spread, and a filter with a wrong spread can
-    be worse than its own sensor. ``DEnKFLoss.paper(filter)`` is the paper's.
+    The default score of an ensemble is the fair CRPS, a proper score: it trains the mean *and* the spread. The
+    paper's loss, the squared error of the mean, does not train the spread, and a filter with a wrong spread can
+    be worse than its own sensor. ``DEnKFLoss.paper(filter)`` returns the paper's loss.
 
     ========================  =====================================================================================
     ``loss_state``            score of the belief, :math:`X_{t|t}` against :math:`x_t`
@@ -33,39 +33,40 @@ class DEnKFLoss(FilterLoss):
     ``loss_sensor``           score of the sensor's samples against the true observation (:math:`L_{s_\xi}`)
     ``loss_observation``      squared error of :math:`h_\psi(x_t)` against the true observation
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
-    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+    ``loss_visible``          binary cross entropy of the sensor's visibility, for a filter with a
                               :class:`~torch_denkf.imperfect.Visibility`
-    ``loss_smoothed``         score of the smoothed belief of each time, given what came later, against :math:`x_t`
+    ``loss_smoothed``         score of the smoothed belief of each time, given later readings, against :math:`x_t`
     ``loss_kl``               KL divergence of flipout weights from their prior, nats
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied, so
-    that their sum is the objective. Only elements that were stepped to count for state, transition, smoothed and nll:
-    the first of a sequence and those with ``is_init`` hold an initial belief. The sensor counts where it observed.
+    that their sum is the objective. Only elements that are results of a step are scored for state, transition, smoothed
+    and nll: the first of a sequence and those with ``is_init`` have an initial belief. The sensor is scored in
+    observed elements.
 
     Args:
         filter: the filter to train; its parameters are the loss's.
-        score: ``"crps"`` (fair), ``"energy"`` (fair energy score, multivariate) or ``"mse"`` (of the mean). Of one
+        score: ``"crps"`` (fair), ``"energy"`` (fair energy score, multivariate) or ``"mse"`` (of the mean). For one
             member the first two are its absolute error, and the length of its error: the scores of a point.
         state: weight of ``loss_state``.
         transition: weight of ``loss_transition``.
-        sensor: weight of ``loss_sensor``; by default 1 where a module of the filter writes the sensor's samples (or
-            ``set_keys(sensor=...)`` names them), else the term is left out.
+        sensor: weight of ``loss_sensor``; by default 1 if a module of the filter writes the sensor's samples (or
+            ``set_keys(sensor=...)`` gives their key), else 0.
         observation: weight of ``loss_observation``.
         nll: weight of ``loss_nll``.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
         kl: weight of ``loss_kl``.
         smoothed: weight of ``loss_smoothed``.
-        smoother: makes the smoothed belief, e.g. ``partial(EnRTS, lag=10)`` or
+        smoother: returns the smoother, e.g. ``partial(EnRTS, lag=10)`` or
             :class:`~torch_denkf.smoothers.EnRTS`; it is called with the filter.
-        terms: terms of your own besides these, see :class:`Term`.
+        terms: further terms of your own, see :class:`Term`.
         **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
-            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
+            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`, also for gaps in the labels.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive, labels of another shape, or slices that are not
             marked.
-        TypeError: for particles with weights, which :class:`MixtureLoss` scores; or a smoother that is none.
+        TypeError: for particles with weights, which :class:`MixtureLoss` scores; or if ``smoother`` makes no smoother.
         KeyError: if an entry that a term needs is missing.
 
     Reference:
@@ -83,7 +84,7 @@ class DEnKFLoss(FilterLoss):
 
     @dataclass
     class _AcceptedKeys(SequenceKeys):
-        """The entries that the loss reads besides those of all losses.
+        """The input keys of the loss, in addition to those of all losses.
 
         Attributes:
             belief: ensemble of the belief.
@@ -116,7 +117,7 @@ class DEnKFLoss(FilterLoss):
         **options: Unpack[SequenceOptions],
     ):
         if smoothed and smoother is None:
-            raise ValueError("loss_smoothed needs to know how: smoother=EnRTS, or partial(EnKS, lag=5), for example.")
+            raise ValueError("loss_smoothed needs a smoother: smoother=EnRTS, or partial(EnKS, lag=5), for example.")
         own: list[Term] = [_terms.Members("state", "belief", state)]
         own += [_terms.Members("transition", "forecast", transition)]
         own += [_terms.Sensor(sensor), _terms.Observation(observation), _terms.Likelihood(nll), _terms.Divergence(kl)]
@@ -125,10 +126,10 @@ class DEnKFLoss(FilterLoss):
         made = smoother if smoother is None or isinstance(smoother, Smoother) else smoother(filter)
         if smoother is not None and (made is smoother or not isinstance(made, Smoother)):
             raise TypeError(
-                "smoother is called with the filter and makes a Smoother, like EnRTS or partial(EnKS, lag=5); got "
+                "smoother is called with the filter and returns a Smoother, like EnRTS or partial(EnKS, lag=5); got "
                 f"{smoother!r}"
             )
-        # In a tuple: its parameters are the filter's, and are the loss's already.
+        # In a tuple, so that it is no sub-module: its parameters are the filter's, which the loss has already.
         self._smoother = (made,)
 
     @classmethod
@@ -138,18 +139,18 @@ class DEnKFLoss(FilterLoss):
 
     @classmethod
     def ad_enkf(cls, filter: Filter, *, detach_every: int | None = None, **kwargs) -> DEnKFLoss:
-        r"""Trains without true states: the likelihood of the innovations alone, as in AD-EnKF.
+        r"""Trains without true states: by the likelihood of the innovations only, as in AD-EnKF.
 
         .. math:: -\log p(y_{1:T}) \approx -\sum_t \log N(y_t; H \bar x_{t|t-1}, H C_{t|t-1} H^T + R)
 
         with the mean and the sample covariance of the forecast ensemble, here as the mean over time steps and
-        sequences. Whatever has a gradient is learned: dynamics, process noise, observation noise. A sensor that is
-        learned as well must keep its meaning by other terms: a constant reading is the most likely one.
+        sequences. Everything with a gradient is learned: dynamics, process noise, observation noise. A learned sensor
+        needs further terms to keep its meaning: a constant reading is the most likely one.
 
         Args:
             filter: the filter to train; with the analysis scheme ``"perturbed"`` it is the paper's.
-            detach_every: length of the sub-sequences between which the gradient is cut (the paper's AD-EnKF-T);
-                chaotic dynamics need it.
+            detach_every: length of the sub-sequences between which the gradient is cut (the paper's AD-EnKF-T), as is
+                needed for chaotic dynamics.
             **kwargs: passed on to the constructor, e.g. the weights of further terms.
 
         Reference:
@@ -174,35 +175,35 @@ class DEnKFLoss(FilterLoss):
 class GaussianLoss(FilterLoss):
     r"""Scores a filter with a mean and a covariance on sequences ``[*B, T]`` against the true states.
 
-    The counterpart of :class:`~torch_denkf.objectives.DEnKFLoss`, whose fair CRPS estimates from members what is a
+    It is the counterpart of :class:`~torch_denkf.objectives.DEnKFLoss`, whose fair CRPS estimates from members the
     closed form here; filters trained with the two have the same objective.
 
     ========================  =====================================================================================
     ``loss_state``            score of the belief against the true state
     ``loss_transition``       score of the forecast against the true state
     ``loss_sensor``           fair CRPS of the sensor's samples against the true observation, which is the absolute
-                              error of one sample or one reading; squared error of their mean with ``score="mse"``
+                              error for one sample or one reading; squared error of their mean with ``score="mse"``
     ``loss_nll``              negative log-likelihood of the innovation, nats; needs no true state
-    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+    ``loss_visible``          binary cross entropy of the sensor's visibility, for a filter with a
                               :class:`~torch_denkf.imperfect.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied. Only
-    elements that were stepped to count for state, transition and nll. The sensor counts where it observed.
+    elements that are results of a step are scored for state, transition and nll; the sensor in observed ones.
 
     Args:
         filter: the filter to train, e.g. :class:`~torch_denkf.filters.EKF`.
-        score: of the Gaussian: ``"crps"`` in each dimension, averaged; ``"nll"``, the negative log-density of all
+        score: score of the Gaussian: ``"crps"`` in each dimension, averaged; ``"nll"``, the negative log-density of all
             dimensions together, in nats; ``"mse"`` of the mean.
         state: weight of ``loss_state``.
         transition: weight of ``loss_transition``.
-        sensor: weight of ``loss_sensor``; by default 1 where a module of the filter writes the sensor's samples (or
-            ``set_keys(sensor=...)`` names them), else the term is left out.
+        sensor: weight of ``loss_sensor``; by default 1 if a module of the filter writes the sensor's samples (or
+            ``set_keys(sensor=...)`` gives their key), else 0.
         nll: weight of ``loss_nll``.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
-        terms: terms of your own besides these, see :class:`Term`.
+        terms: further terms of your own, see :class:`Term`.
         **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
-            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. It also says what gaps in the labels are.
+            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`, also for gaps in the labels.
 
     Raises:
         ValueError: on an unknown score, a scale that is not positive or of another length than ``dims``, labels of
@@ -248,9 +249,9 @@ class GaussianLoss(FilterLoss):
 class MixtureLoss(FilterLoss):
     r"""Scores a filter with weighted particles on sequences ``[*B, T]`` against the true states.
 
-    The default score takes each particle for the centre of a Gaussian: :math:`-\log \sum_i w^i N(x; x^i,
-    \mathrm{diag}(\sigma^2))`, which has a gradient where no particle is near the truth. It is the "M" of Kloss' dPF-M.
-    The CRPS has no such width to choose, and makes filters comparable with those that were trained with
+    The default score is of a mixture of Gaussians around the particles: :math:`-\log \sum_i w^i N(x; x^i,
+    \mathrm{diag}(\sigma^2))`; it has a gradient even if no particle is near the truth. It is the "M" of Kloss' dPF-M.
+    The CRPS has no such width to choose, and makes filters comparable with filters trained with
     :class:`~torch_denkf.objectives.DEnKFLoss`.
 
     ========================  =====================================================================================
@@ -258,32 +259,32 @@ class MixtureLoss(FilterLoss):
     ``loss_transition``       score of the forecast, with its weights, against the true state
     ``loss_mean``             squared error of the belief's weighted mean
     ``loss_sensor``           fair CRPS of the sensor's samples against the true observation, which is the absolute
-                              error of one sample or one reading
+                              error for one sample or one reading
     ``loss_nll``              negative log-likelihood of the reading, nats; needs no true state
-    ``loss_visible``          binary cross entropy of whether the sensor sees, of a filter with a
+    ``loss_visible``          binary cross entropy of the sensor's visibility, for a filter with a
                               :class:`~torch_denkf.imperfect.Visibility`
     ========================  =====================================================================================
 
     Terms with weight zero are neither computed nor returned; the others are returned with their weight applied, so
-    that their sum is the objective. Only elements that were stepped to count: the first of a sequence and those with
-    ``is_init`` hold an initial belief. The sensor counts where it observed.
+    that their sum is the objective. Only elements that are results of a step are scored: the first of a sequence and
+    those with ``is_init`` have an initial belief. The sensor is scored in observed elements.
 
     Args:
-        filter: the filter to train, e.g. :class:`~torch_denkf.filters.DPF`. Members without weights count alike.
+        filter: the filter to train, e.g. :class:`~torch_denkf.filters.DPF`. Members without weights have equal weight.
         score: ``"mixture"``, in nats, or ``"crps"``, the weighted CRPS (not fair: there is no fair one with weights)
             in each dimension, averaged.
-        component_std: :math:`\sigma`, a number or one for each of ``dims``, else of the labels' dimensions, in units of
-            ``state_scale``.
+        component_std: :math:`\sigma`, one number or one for each of ``dims``, else of the labels' dimensions, in units
+            of ``state_scale``.
         state: weight of ``loss_state``.
         transition: weight of ``loss_transition``.
         mean: weight of ``loss_mean``.
         sensor: weight of ``loss_sensor``.
         nll: weight of ``loss_nll``.
         visible: weight of ``loss_visible``; its labels are ``"visible"``, and may have gaps.
-        terms: terms of your own besides these, see :class:`Term`.
+        terms: further terms of your own, see :class:`Term`.
         **options: ``dims``, scales, ``space``, ``reading_space``, ``detach_every`` and ``reduction``, see
-            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. With a ``state_scale`` the mixture
-            is a density of the state in its own units all the same.
+            :class:`~torch_denkf.objectives.filter_loss.SequenceOptions`. The mixture is a density of the state in its
+            own units, also with a ``state_scale``.
 
     Raises:
         ValueError: on an unknown score, a width or scale that is not positive or of another length than ``dims``,

@@ -1,9 +1,9 @@
-"""Pictures of beliefs: paths, bands over time, calibration, videos.
+"""Plots of beliefs: paths, bands over time, calibration, videos.
 
-Each function takes what a roll-out or :meth:`torch_denkf.filters.Filter.sequence` gives, or plain tensors. It draws
-into the Axes that it is given, or into a figure of its own, and returns the Axes; ``axes.figure.savefig("path.png")``
-writes it. Figures of its own are not known to pyplot: nothing pops up, nothing has to be closed. Pass an Axes of
-``plt.subplots()`` where a window or a notebook is to show it.
+Each function takes a roll-out, the result of :meth:`torch_denkf.filters.Filter.sequence`, or plain tensors. It draws
+into the given Axes, or into a new figure, and returns the Axes; ``axes.figure.savefig("path.png")`` writes the figure.
+New figures are not registered with pyplot: no window opens, and they need not be closed. For a window or a notebook,
+pass an Axes of ``plt.subplots()``.
 
 Needs matplotlib and pillow, ``pip install "torch_denkf[plots]"``; importing this package needs neither.
 """

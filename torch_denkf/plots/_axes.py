@@ -1,4 +1,4 @@
-"""Axes to draw into, colours that colour-blind people tell apart, and legends that cover no data."""
+"""Axes, colours for colour-blind readers, and legends that cover no data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """Returns a figure of its own that pyplot does not know, width and height in inches.
+    """Returns a new figure that is not registered with pyplot, width and height in inches.
 
     Raises:
         ImportError: without matplotlib.
@@ -38,12 +38,12 @@ def new_figure(size: tuple[float, float]) -> Figure:
 def axes_for(
     ax: Axes | Sequence[Axes] | None, count: int, size: tuple[float, float], *, share: bool = False
 ) -> list[Axes]:
-    """Returns the Axes that were passed, or ``count`` new ones below each other.
+    """Returns the given Axes, or ``count`` new ones in a column.
 
     Args:
         ax: an Axes, ``count`` of them, or ``None``.
-        count: how many are needed.
-        size: of a new figure, width and height in inches.
+        count: number of Axes.
+        size: width and height of a new figure in inches.
         share: whether new Axes share their horizontal axis.
 
     Raises:
@@ -60,9 +60,9 @@ def axes_for(
 
 
 def legend_above(axes: Axes, *others: Axes) -> None:
-    """Adds a legend over the Axes for all that is labelled in it and in the others, in as many columns as fit.
+    """Adds a legend above the Axes for all labels in it and in the others, in as many columns as fit.
 
-    For a headline use ``axes.figure.suptitle``.
+    For a title use ``axes.figure.suptitle``.
     """
     found: dict[str, Any] = {}
     for part in (axes, *others):
@@ -72,7 +72,7 @@ def legend_above(axes: Axes, *others: Axes) -> None:
     if not handles:
         return
     pixels, whole = axes.get_window_extent().width, axes.figure.bbox.width
-    pixels *= 1.1 if pixels > 0.7 * whole else 1.0  # the layout to come widens one that has the figure to itself
+    pixels *= 1.1 if pixels > 0.7 * whole else 1.0  # the layout will widen a single Axes
     width = 72 * pixels / axes.figure.dpi  # points
     sizes = [4.8 * len(label) + 43 for label in labels]
     columns = len(labels)
@@ -91,12 +91,12 @@ def legend_above(axes: Axes, *others: Axes) -> None:
         fontsize=9,
         frameon=False,
     )
-    for handle in legend.get_lines():  # faint lines, one of many, are seen in the legend too
+    for handle in legend.get_lines():  # makes faint lines visible in the legend
         handle.set_alpha(max(handle.get_alpha() or 1.0, 0.6))
 
 
 def label_below(panels: Sequence[Axes], label: str) -> None:
-    """Labels the horizontal axis of the lowest Axes: the last of a column, all of a row."""
+    """Labels the horizontal axis of the lowest Axes: the last one of a column, or all of a row."""
     bottoms = [axes.get_position().y0 for axes in panels]
     for axes, bottom in zip(panels, bottoms, strict=True):
         if bottom < min(bottoms) + 1e-6:
@@ -104,7 +104,7 @@ def label_below(panels: Sequence[Axes], label: str) -> None:
 
 
 def one_each(what: str, given: Sequence[T] | None, default: list[T]) -> list[T]:
-    """Returns one value a drawn component.
+    """Returns one value per drawn component.
 
     Raises:
         ValueError: if there are more or fewer.
@@ -115,28 +115,28 @@ def one_each(what: str, given: Sequence[T] | None, default: list[T]) -> list[T]:
 
 
 def labels_for(names: Sequence[str] | None, dims: Sequence[int]) -> list[str]:
-    """Returns one label a component: the names, or ``state 3`` for dimension 3."""
+    """Returns one label per component: the names, or ``state 3`` for dimension 3."""
     return one_each("names", names, [f"state {dim}" for dim in dims])
 
 
 def times_of(time: float | Tensor | None, steps: int) -> np.ndarray:
-    """Returns seconds of the steps ``[T]`` from the seconds between two, or the steps' numbers.
+    """Returns the times of the steps ``[T]``: given times, multiples of a time step, or step numbers.
 
     Raises:
-        ValueError: for another number of times, and where they decrease, or are all the same.
+        ValueError: for a wrong number of times, and for times that decrease or are all equal.
     """
     if isinstance(time, Tensor):
         seconds = time.detach().cpu().double().flatten().numpy()
     else:
         seconds = np.arange(steps) * (1.0 if time is None else float(time))
-    gaps = np.diff(seconds)  # a row may stand at the time of the one before
+    gaps = np.diff(seconds)  # rows may have equal times
     if len(seconds) != steps or bool((gaps < 0).any()) or (len(gaps) > 0 and not gaps.any()):
         raise ValueError(f"time must be {steps} increasing seconds, one a step, or the seconds between two")
     return seconds
 
 
 def step_bounds(seconds: np.ndarray) -> np.ndarray:
-    """Returns the borders of steps, half way between their times, ``[T+1]``."""
+    """Returns the boundaries of steps, half way between their times, ``[T+1]``."""
     if len(seconds) == 1:
         return np.array([seconds[0] - 0.5, seconds[0] + 0.5])
     middle = (seconds[1:] + seconds[:-1]) / 2

@@ -1,4 +1,4 @@
-"""Belief, truth and observed masks of a roll-out, as plots read them."""
+"""Reads belief, truth and observed masks of a roll-out for plots."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ TensorOrKey: TypeAlias = Tensor | NestedKey | None
 
 
 class Belief(NamedTuple):
-    """Detached, in float64 and on the CPU; what is not there is ``None``.
+    """Belief for plots: detached, in float64 and on the CPU; missing entries are ``None``.
 
     Attributes:
         mean: ``[*B, S]``.
         var: ``[*B, S]``.
         cov: ``[*B, S, S]``.
         ensemble: ``[*B, E, S]``.
-        log_weight: of particles, ``[*B, E]``.
+        log_weight: weights of particles, ``[*B, E]``.
         truth: ``[*B, S']``; S' may be smaller than S.
         observed: ``[*B, O]`` bool.
-        known: ``[*B]`` bool, False where a smoother with a lag says nothing of the state; all else is NaN there.
-        name: in legends.
+        known: ``[*B]`` bool, False if a fixed-lag smoother has no estimate of the state; all other entries are NaN
+            there.
+        name: name in legends.
     """
 
     mean: Tensor
@@ -43,7 +44,7 @@ class Belief(NamedTuple):
 
     @property
     def ensemble_size(self) -> int | None:
-        """Returns E of an ensemble whose members have one weight, else ``None``."""
+        """Returns E of an ensemble with equal weights, else ``None``."""
         return None if self.ensemble is None or self.log_weight is not None else self.ensemble.shape[-2]
 
 
@@ -61,16 +62,16 @@ def read_belief(
     Args:
         run: a roll-out with ``("belief", "mean")`` or ``("belief", "ensemble")``; or the belief itself, with
             ``"mean"`` or ``"ensemble"``, such as ``rollout["forecast"]``; or means ``[*B, S]``.
-        truth: a tensor ``[*B, S']``, a key of the roll-out, or ``None`` for ``"state"`` where it is there.
-        observed: a tensor ``[*B, O]`` or ``[*B]`` bool, a key, or ``None`` for ``"observed"`` where it is there.
-        belief: which belief of the roll-out, such as ``"smoothed"``. One of the state ``"age"`` steps ago, as
-            :class:`~torch_denkf.smoothers.FixedLag` writes it, is moved to the row of that state.
-        one_sequence: whether ``*B`` has to be ``T``.
-        space: whose points ``[*B, P]`` the states are; variances are those of tangents ``[*B, D]``.
+        truth: a tensor ``[*B, S']``, a key of the roll-out, or ``None`` for ``"state"`` if it exists.
+        observed: a tensor ``[*B, O]`` or ``[*B]`` bool, a key, or ``None`` for ``"observed"`` if it exists.
+        belief: key of the belief in the roll-out, such as ``"smoothed"``. A belief of the state ``"age"`` steps ago,
+            from :class:`~torch_denkf.smoothers.FixedLag`, is moved to the row of that state.
+        one_sequence: whether ``*B`` must be ``T``.
+        space: space of the states, points ``[*B, P]``; variances are those of tangents ``[*B, D]``.
 
     Raises:
-        KeyError: if the roll-out has no belief, or not the key that was named.
-        ValueError: if the shapes do not fit.
+        KeyError: if the roll-out has no belief, or lacks a given key.
+        ValueError: if the shapes do not match.
     """
     age, last = None, belief if isinstance(belief, str) else belief[-1]
     if isinstance(run, Tensor):
@@ -86,7 +87,7 @@ def read_belief(
             )
         age = root.get("age", None)
         if age is not None and (weight := run.get(("belief", "log_weight"), None)) is not None:
-            parts.setdefault("log_weight", number(weight))  # particles of long ago weigh what they weigh now
+            parts.setdefault("log_weight", number(weight))  # past particles have the present weights
     parts = _summarise(parts, space)
     if space is None and "var" in parts and parts["var"].shape != parts["mean"].shape:
         raise ValueError(
@@ -161,10 +162,10 @@ def with_truth(read: Belief, dims: list[int]) -> Tensor:
 
 
 def entry_of(source: TensorDictBase | Tensor, value: Any, default: str) -> Any:
-    """Returns a tensor or array that is passed, that of a key, or the ``default`` entry if the roll-out has it.
+    """Returns a given tensor or array, the entry of a given key, or the ``default`` entry if the roll-out has it.
 
     Raises:
-        KeyError: if there is no such key, or nothing that could have keys.
+        KeyError: if there is no such key, or the roll-out is a tensor.
     """
     if isinstance(value, (Tensor, np.ndarray)):
         return value
@@ -179,10 +180,10 @@ def entry_of(source: TensorDictBase | Tensor, value: Any, default: str) -> Any:
 
 
 def _to_rows_of_states(parts: dict[str, Tensor], age: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-    """Moves what row t says of the state of t - age to that state's row, from the latest row that says something of it.
+    """Moves the smoothed entries of row t to the row of their time, t - age; later rows have priority.
 
     Returns:
-        The parts, NaN where no row says anything, and where any does, ``[*B]``.
+        The parts, NaN in rows without an estimate, and the mask of rows with one, ``[*B]``.
     """
     time = age.ndim - 1
     rows = torch.arange(age.shape[-1]).expand_as(age)
@@ -196,7 +197,7 @@ def _to_rows_of_states(parts: dict[str, Tensor], age: Tensor) -> tuple[dict[str,
 
 
 def _summarise(parts: dict[str, Tensor], space: Space | None) -> dict[str, Tensor]:
-    """Adds mean and variance where they follow from what is there."""
+    """Adds mean and variance if they can be computed."""
     if space is not None:
         space.check(**{name: parts[name] for name in ("mean", "ensemble") if name in parts})
     ensemble, weight, cov = parts.get("ensemble"), parts.get("log_weight"), parts.get("cov")

@@ -1,4 +1,4 @@
-"""Pictures as arrays, and files that take them one by one."""
+"""Images as arrays, and video files that are written frame by frame."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Writes ``[H, W, 3]`` RGB frames as MPEG-4 with OpenCV.
 
     Raises:
-        OSError: if OpenCV cannot write the file; it does not say why.
+        OSError: if OpenCV cannot write the file; the reason is unknown.
         ValueError: without frames, and for frames of several sizes.
     """
     import cv2
@@ -50,7 +50,7 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
             height, width = frame.shape[:2]
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if writer is None:
-                from torch_denkf.deployment.files import name_for_c  # which imports torchrl; pictures need none
+                from torch_denkf.deployment.files import name_for_c  # imported here, as it imports torchrl
 
                 writer = cv2.VideoWriter(name_for_c(file), cv2.VideoWriter.fourcc(*"mp4v"), fps, frame.shape[1::-1])
                 if not writer.isOpened():
@@ -60,7 +60,7 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     finally:
         if writer is not None:
             writer.release()
-    # OpenCV passes over what it cannot write: a full disk shows when the file is read.
+    # OpenCV ignores write errors: a full disk is detected by reading the file.
     capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
     whole = capture.isOpened() and round(capture.get(cv2.CAP_PROP_FRAME_COUNT)) >= written
     capture.release()
@@ -69,9 +69,9 @@ def write_mp4(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
 
 def write_gif(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Writes ``[H, W, 3]`` RGB frames as a GIF that repeats for ever, each with its own 256 colours.
+    """Writes ``[H, W, 3]`` RGB frames as an endless GIF, each with its own 256 colours.
 
-    Pillow's own ``save_all`` keeps all frames until the last one; here each is written when it comes.
+    Pillow's ``save_all`` keeps all frames in memory; here each is written at once.
 
     Raises:
         ImportError: without pillow.
@@ -82,7 +82,7 @@ def write_gif(file: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     except ImportError as error:
         raise ImportError('GIF files need pillow: pip install "torch_denkf[plots]"') from error
     frames = _of_one_size(frames)
-    first = next(frames)  # before there is a file
+    first = next(frames)  # raises before the file is created
     with open(file, "wb") as out:
         height, width = first.shape[:2]
         out.write(_GIF_HEAD + width.to_bytes(2, "little") + height.to_bytes(2, "little") + bytes(3) + _GIF_FOREVER)

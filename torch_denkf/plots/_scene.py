@@ -1,4 +1,4 @@
-"""The figure that a video shows."""
+"""Figure of a video."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Scene:
-    """The figure of a video: everything is drawn once, and each frame shows what has happened until then."""
+    """Figure of a video: everything is drawn once, and each frame shows the data until its time."""
 
     def __init__(
         self,
@@ -57,9 +57,9 @@ class Scene:
             figure.suptitle(title)
 
     def freeze(self, seen: Tensor | None, seconds: np.ndarray) -> None:
-        """Fixes layout and limits, and draws once what stands still, with the bands and without."""
+        """Fixes layout and limits, and draws the static parts once, with and without the bands."""
         self.seen, self.bounds = seen, step_bounds(seconds)
-        if self.camera is not None:  # a path that is drawn on it stretches nothing
+        if self.camera is not None:  # the path does not change the image's limits
             height, width = self.image.get_size()
             self.camera.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="", ylabel="")
             self.camera.set_aspect("equal", adjustable="box")
@@ -96,7 +96,7 @@ class Scene:
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def _outline_lines(self) -> None:
-        """Makes the lines on the picture seen where it is dark."""
+        """Outlines the lines on the image in white, for dark images."""
         from matplotlib.patheffects import withStroke
 
         for line in self.camera.get_lines() if self.camera is not None else ():
@@ -104,7 +104,7 @@ class Scene:
                 line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1, foreground="white")])
 
     def _shrink_labels(self) -> None:
-        """Makes the bands' names fit next to their Axes, all of one size."""
+        """Shrinks the bands' labels to fit next to their Axes, all in the same size."""
         self.figure.draw_without_rendering()
         labels = [axes.yaxis.label for axes in self.bands]
         needed = [label.get_window_extent().height for label in labels]
@@ -145,7 +145,7 @@ class Scene:
         return picture
 
     def _uncover(self, picture: np.ndarray, axes: Axes, until: float) -> None:
-        """Copies into the picture what is drawn in the Axes at the left of ``until``."""
+        """Copies the drawing in the Axes left of ``until`` into the image."""
         box, height = axes.get_window_extent(), len(picture)
         right = min(axes.transData.transform((until, 0))[0], box.x1)
         rows, columns = slice(round(height - box.y1), round(height - box.y0)), slice(round(box.x0), round(right))

@@ -1,4 +1,4 @@
-"""Beliefs of points of a space, in numbers that can be drawn: roll, pitch and yaw of a quaternion."""
+"""Beliefs on a space in components for plots: roll, pitch and yaw of a quaternion."""
 
 from __future__ import annotations
 
@@ -12,18 +12,17 @@ __all__ = ["angles_of", "in_components", "in_tangents", "names_of"]
 
 
 def in_components(read: Belief, space: Space) -> Belief:
-    """Returns the belief in as many numbers as tangents have, D: roll, pitch and yaw in rad stand for a quaternion.
+    """Returns the belief in D components, as many as tangents have: roll, pitch and yaw in rad replace a quaternion.
 
-    Roll is about x, then pitch about y, then yaw about z, of axes that do not turn; pitch lies in [-pi/2, pi/2]. The
-    variances, of tangents at the mean, are carried over by the derivative there. It has no end where pitch is +-pi/2:
-    roll and yaw are the same turn there.
+    Roll about x, then pitch about y, then yaw about z, are rotations about fixed axes; pitch is in [-pi/2, pi/2]. The
+    variances of tangents are transformed by the derivative at the mean, which is infinite at a pitch of +-pi/2 (gimbal
+    lock).
 
     Args:
         read: points ``[*, P]``, variances and covariances of tangents.
-        space: whose points they are.
+        space: space of the points.
 
-    Returns:
-        A belief ``[*, D]``; NaN where a part of the truth is not known.
+    Returns: A belief ``[*, D]``; NaN for unknown parts of the truth.
     """
     truth = read.truth
     if truth is not None and truth.shape[-1] < space.point_dim:
@@ -40,14 +39,13 @@ def in_components(read: Belief, space: Space) -> Belief:
 
 
 def in_tangents(read: Belief, space: Space) -> Belief:
-    """Returns the belief as tangents at its mean, ``[*, D]``: the mean is zero, the truth its distance to it.
+    """Returns the belief as tangents at its mean, ``[*, D]``: the mean is zero, the truth its difference from the mean.
 
     Args:
         read: points ``[*, P]``, variances of tangents.
-        space: whose points they are.
+        space: space of the points.
 
-    Returns:
-        A belief ``[*, D]``. Its truth has the parts that the given one has, with NaN where a part is not known.
+    Returns: A belief ``[*, D]``. Its truth has the parts of the given one, with NaN for unknown parts.
     """
     mean, truth, ensemble = read.mean, read.truth, read.ensemble
     if truth is not None:
@@ -62,12 +60,12 @@ def in_tangents(read: Belief, space: Space) -> Belief:
 
 
 def angles_of(space: Space) -> list[int]:
-    """Returns the indices of the D numbers that are angles."""
+    """Returns the indices of the D components that are angles."""
     return [index for place in places_of(space) for index in range(place.rotation.start, place.rotation.stop)]
 
 
 def names_of(space: Space, turns: tuple[str, ...] = ("roll, deg", "pitch, deg", "yaw, deg")) -> list[str]:
-    """Returns a label for each of the D numbers, with degrees for angles; ``turns`` are those of a rotation."""
+    """Returns a label for each of the D components, with degrees for angles; ``turns`` are the labels of a rotation."""
     names = [f"state {index}" for index in range(space.tangent_dim)]
     for place in places_of(space):
         names[place.rotation] = turns if _turns(place) == 3 else ("heading, deg",) * _turns(place)
@@ -94,7 +92,7 @@ def _components(point: Tensor, space: Space) -> Tensor:
 
 
 def _slope(mean: Tensor, space: Space) -> Tensor:
-    """Returns the derivative of the D numbers by the tangent, ``[*, D, D]``, at points ``[*, P]``."""
+    """Returns the derivative of the D components with respect to the tangent, ``[*, D, D]``, at points ``[*, P]``."""
 
     def moved(tangent: Tensor, point: Tensor) -> Tensor:
         return _components(space.plus(point, tangent), space)

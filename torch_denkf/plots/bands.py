@@ -1,4 +1,4 @@
-"""Components of a belief over time, with the band that should hold the truth."""
+"""Components of a belief over time, with a credible band."""
 
 from __future__ import annotations
 
@@ -53,40 +53,38 @@ def plot_bands(
     legend: bool = True,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> list[Axes]:
-    """Draws components over time: the belief's mean and band, the truth, readings, and where none was observed.
+    """Draws components over time: the belief's mean and band, the truth, readings, and outages.
 
     Args:
         run: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` and ``("belief", "var")`` or
             ``("belief", "ensemble")`` ``[T, E, S]``; or means ``[T, S]``, which have no band.
-        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
-        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote: each state's in the state's step.
+        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out if it exists.
+        belief: key of the belief, such as a smoother's ``"smoothed"``, which is drawn at the step of each state.
         dims: components to draw, an Axes each; all by default.
-        names: a label with its unit for each of them, such as ``"v, m/s"``.
-        factors: what each is multiplied with, such as ``180 / pi`` for degrees.
-        readings: by component, ``[T]`` in the state's units; NaN and what is not observed are left out.
-        observed: ``[T]``, ``[T, 1]`` or ``[T, O]`` bool, or its key; by default ``"observed"`` of the roll-out where it
-            is there. Stretches without a reading are shaded. With several sensors, one for each component:
-            ``{0: "gps_observed", 1: encoder_mask}``; components without one are not shaded.
-        gap: the longest time from one reading to the next that is no outage, in s, or in steps where ``time`` is not
-            given; what is longer is shaded. By default one and a half times the median, so that a sensor at 1 Hz in a
-            filter at 100 Hz is shaded where it lost a reading, and not between two.
+        names: label with unit of each component, such as ``"v, m/s"``.
+        factors: factor on each component, such as ``180 / pi`` for degrees.
+        readings: readings by component, ``[T]`` in the state's units; NaN and unobserved ones are left out.
+        observed: ``[T]``, ``[T, 1]`` or ``[T, O]`` bool, or its key; by default ``"observed"`` of the roll-out if it
+            exists. Outages are shaded. With several sensors, one for each component: ``{0: "gps_observed", 1:
+            encoder_mask}``; components without one are not shaded.
+        gap: longest time between two readings that is no outage, in s, or in steps without ``time``. By default one and
+            a half times the median, so that for a sensor at 1 Hz in a filter at 100 Hz only lost readings are shaded.
         time: seconds of the steps ``[T]``, or the seconds between two; by default steps are counted.
         level: probability of the band.
         band: ``"ensemble"`` draws quantiles of the members; ``"variance"`` draws those of a Gaussian. ``"auto"`` takes
-            the ensemble where its members have equal weights and are enough for ``level``.
-        space: whose points the states are; ``None`` for plain numbers. Components are then those of tangents, with
-            angles, and roll, pitch and yaw of a quaternion, in degrees, between -180 and 180: a line that leaves at one
-            end goes on at the other. ``readings`` of angles are in rad.
-        legend: whether to add one above the first Axes.
+            the ensemble if its members have equal weights and are enough for ``level``.
+        space: space of the states; ``None`` for vectors. Components are then those of tangents, with angles, and roll,
+            pitch and yaw of a quaternion, in degrees, wrapped to -180 to 180. ``readings`` of angles are in rad.
+        legend: whether to add a legend above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 
     Returns:
-        The Axes, one a component.
+        The Axes, one per component.
 
     Raises:
         ImportError: without matplotlib; the message names the extra.
-        KeyError: if the roll-out has no belief, or not the keys that were named.
-        ValueError: for more than one sequence, for shapes that do not fit, and for a band that is not there.
+        KeyError: if the roll-out has no belief, or lacks a given key.
+        ValueError: for more than one sequence, shapes that do not match, and a band that the belief does not have.
         IndexError: if ``dims`` names no dimension.
 
     Example:
@@ -151,7 +149,7 @@ def plot_bands(
                 axes.plot(seconds, (scale * (true[:, column] - away)).numpy(), **style)
             style = {"color": BELIEF, "linewidth": 1.4, "label": read.name if named else None}
             axes.plot(seconds, (scale * (line - away)).numpy(), **style)
-        if len(turns) > 1:  # what lies beyond half a turn is cut off, and drawn at the other end
+        if len(turns) > 1:  # values beyond half a turn are wrapped to the other end
             axes.set_ylim(-np.pi * scale, np.pi * scale)
             axes.set_yticks(scale * np.linspace(-np.pi, np.pi, 5))
         axes.set_ylabel(label)
@@ -206,7 +204,7 @@ def _unwrap(angle: Tensor) -> Tensor:
 
 
 def _turns(drawn: Sequence[Tensor | None], column: int) -> list[int]:
-    """Returns the turns, 0 from -pi to pi, of unwrapped angles: of what is drawn, ``[T, K]`` each, in a column."""
+    """Returns the turns that a column of unwrapped angles ``[T, K]`` covers; turn 0 is -pi to pi."""
     values = torch.cat([value[:, column] for value in drawn if value is not None])
     values = values[values.isfinite()]
     if not len(values):
@@ -226,7 +224,7 @@ def _outages(seen: Tensor, seconds: np.ndarray, gap: float | None) -> np.ndarray
     change = np.diff(np.concatenate([[0], (~seen).numpy().astype(int), [0]]))
     first, last = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    # As if there had been a reading one step before the first step, and one step after the last.
+    # Assumes a reading one step before the first step, and one step after the last.
     around = np.concatenate([[seconds[0] - step], seconds, [seconds[-1] + step]])
     if gap is None:
         readings = seconds[seen.numpy()]

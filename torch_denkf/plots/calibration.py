@@ -38,7 +38,7 @@ def plot_calibration(
     legend: bool = True,
     ax: Axes | Sequence[Axes] | None = None,
 ) -> list[Axes]:
-    """Draws where the truth lies in the belief: flat for a calibrated filter, high at both ends if it trusts itself.
+    """Draws a histogram of the truth within the belief: flat if calibrated, high at both ends if overconfident.
 
     A Gaussian belief gives the probability integral transform, an ensemble the rank of the truth among its members.
     The bars of a calibrated filter all end in the grey band with probability ``level``, if the states are independent.
@@ -47,29 +47,28 @@ def plot_calibration(
         run: roll-outs or sequences ``[*B]``, time last, with ``("belief", "mean")`` ``[*B, S]`` and
             ``("belief", "var")``, or ``("belief", "ensemble")`` ``[*B, E, S]``.
         truth: ``[*B, S']``, or its key; by default ``"state"`` of the roll-out.
-        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
+        belief: key of the belief, such as a smoother's ``"smoothed"``.
         dims: components to draw, an Axes each; all by default.
-        names: a label for each of them.
-        kind: ``"rank"`` or ``"pit"``; ``"auto"`` takes ranks where there is an ensemble. Particles count with their
-            weights, ``("belief", "log_weight")`` ``[*B, E]``; where a few have nearly all the weight, the outer bars
-            are a little higher.
-        bins: of the histogram. An ensemble's E+1 ranks are laid on them in equal parts.
-        every: use every n-th step of time. Errors of successive steps are alike, which moves bars out of the band.
+        names: label of each component.
+        kind: ``"rank"`` or ``"pit"``; ``"auto"`` takes ranks if there is an ensemble. Particles count with their
+            weights, ``("belief", "log_weight")`` ``[*B, E]``; if a few have nearly all the weight, the outer bars are a
+            little higher.
+        bins: number of bins, among which an ensemble's E+1 ranks are divided equally.
+        every: use every n-th step of time. Errors of successive steps are correlated, which moves bars out of the band.
         level: probability of the band, for all bars of an Axes together.
-        space: whose points the states are; ``None`` for plain numbers. Components are then those of the tangent from
-            the mean to the truth: a rotation has three, about the body's axes.
-        legend: whether to add one above the first Axes.
+        space: space of the states; ``None`` for vectors. Components are then those of the tangent from the mean to the
+            truth: a rotation has three, about the body's axes.
+        legend: whether to add a legend above the first Axes.
         ax: as many Axes as components; ``None`` makes a figure.
 
     Returns:
-        The Axes, one a component, with a bar a bin, its height in per cent of the states; the band has the gid
-        ``"band"``.
+        The Axes, one per component, with bars in per cent of the states; the band has the gid ``"band"``.
 
     Raises:
         ImportError: without matplotlib; the message names the extra.
-        KeyError: if the roll-out has no belief, or not the truth that was named.
-        ValueError: without a truth, for shapes that do not fit, for a kind that the belief cannot give, and for more
-            bins than an ensemble has ranks.
+        KeyError: if the roll-out has no belief, or lacks the given truth.
+        ValueError: without a truth, for shapes that do not match, for a kind that the belief does not allow, and for
+            more bins than an ensemble has ranks.
         IndexError: if ``dims`` names no dimension.
 
     Example:
@@ -124,7 +123,7 @@ def plot_calibration(
 
 
 def _rebin(counts: Tensor, bins: int) -> Tensor:
-    """Lays E+1 ranks on [0, 1] in equal parts and counts again, ``[S, bins]``; parts of ranks go to two bins."""
+    """Divides E+1 ranks equally among bins, ``[S, bins]``; a rank at a boundary is split between two bins."""
     ranks = counts.shape[-1]
     if bins > ranks:
         raise ValueError(f"{ranks - 1} members have {ranks} ranks, too few for {bins} bins")

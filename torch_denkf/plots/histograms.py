@@ -15,7 +15,7 @@ __all__ = ["SpreadError", "histogram_band", "rank_histogram", "spread_error"]
 
 
 class SpreadError(NamedTuple):
-    """Holds the results of :func:`spread_error`.
+    """Result of :func:`spread_error`.
 
     Attributes:
         spread: root mean square of the predicted standard deviation in each bin, ``[S, bins]``, ascending.
@@ -36,20 +36,20 @@ def rank_histogram(
     """Counts how often the truth falls into each of the E+1 gaps between and beyond the sorted members.
 
     The histogram is flat, up to chance, for a calibrated ensemble, Gaussian or not. It is high at both ends for an
-    overconfident one. A truth that equals some members counts in equal parts in all the gaps that they separate.
+    overconfident one. A truth equal to some members is divided equally among the gaps next to them.
 
     Args:
         ensemble: ``[*B, E, S]``.
         truth: ``[*B, S]``, in the same units.
-        log_weight: of particles, ``[*B, E]``. A particle of weight w counts as E w members of equal weight, and a truth
-            between two ranks in both. Without it, all members weigh the same.
-        space: whose points members and truth are; ``None`` for plain numbers. Tangents at the members' mean are ranked.
+        log_weight: weights of particles, ``[*B, E]``. A particle of weight w counts as E w members of equal weight, and
+            a truth between two ranks is divided between both. Without it, all weights are equal.
+        space: space of members and truth; ``None`` for vectors. Tangents at the members' mean are ranked.
 
     Returns:
         Counts, ``[S, E+1]`` float64; each row sums to the number of states in ``*B``.
 
     Raises:
-        ValueError: if the shapes do not fit, if a value is not finite, or for points of another space.
+        ValueError: if the shapes do not match, if a value is not finite, or for points of another space.
 
     Reference:
         Hamill 2001, "Interpretation of rank histograms for verifying ensemble forecasts", Mon. Weather Rev. 129.
@@ -72,7 +72,8 @@ def rank_histogram(
     above = below + count.where(members == offset, 0.0).sum(-2).flatten(0, -2).T + 1
     part = 1.0 / (above - below)
     steps = torch.zeros(members.shape[-1], size + 3, dtype=torch.float64, device=members.device)
-    for edge, height in ((below, part), (above, -part)):  # each truth lies evenly on the ranks between its edges
+    # each truth is divided equally among the ranks between its edges
+    for edge, height in ((below, part), (above, -part)):
         whole = edge.floor().clamp(max=size + 1)
         steps.scatter_add_(1, whole.long(), (1 - edge + whole) * height)
         steps.scatter_add_(1, whole.long() + 1, (edge - whole) * height)
@@ -80,17 +81,17 @@ def rank_histogram(
 
 
 def histogram_band(samples: int, bins: int, *, level: float = 0.99) -> tuple[int, int]:
-    """Counts between which all bars of a flat histogram stay together with at least probability ``level``.
+    """Returns bounds that all bars of a flat histogram satisfy jointly with at least probability ``level``.
 
-    Each bar is binomial; by Bonferroni's bound each is granted a share (1 - level) / bins of being outside.
+    Each bar is binomial, and outside with a probability of at most (1 - level) / bins (Bonferroni).
 
     Args:
         samples: independent samples in the histogram. Errors of successive steps are not independent: use every n-th.
-        bins: of the histogram.
+        bins: number of bins.
         level: probability of the band.
 
     Returns:
-        The least and the largest count.
+        Smallest and largest count.
 
     Raises:
         ValueError: if ``level`` is not in (0, 1), or without samples or bins.
@@ -125,16 +126,16 @@ def spread_error(
 ) -> SpreadError:
     """Returns the predicted spread and actual error, in bins of states with similar spread.
 
-    A filter that knows how wrong it is has spread = error in each bin.
+    A calibrated filter has spread = error in each bin.
 
     Args:
         mean: ``[*B, S]``.
-        variance: ``[*B, S]``; of an ensemble with divisor E-1.
-        truth: ``[*B, S]``, in the same units; what is NaN does not count.
-        bins: of equal size up to one state, by the rank of the spread.
+        variance: ``[*B, S]``; for an ensemble with divisor E-1.
+        truth: ``[*B, S]``, in the same units; NaN is left out.
+        bins: number of bins, of equal size up to one state, by the rank of the spread.
         ensemble_size: E, which scales the variance with (E+1)/E, see :func:`spread_skill_ratio`; ``None`` for a
             distribution whose moments are exact.
-        space: whose points ``[*B, P]`` mean and truth are; ``None`` for plain numbers. The variance is one of tangents.
+        space: space of mean and truth, points ``[*B, P]``; ``None`` for vectors. The variance is that of tangents.
 
     Returns:
         A :class:`SpreadError`, in the units of the state.

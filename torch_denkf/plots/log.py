@@ -1,4 +1,4 @@
-"""The streams of a log: when each has read, turn rates on one clock, and the path."""
+"""Plots the streams of a log: time steps, and quantities that several streams share."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["draw_log"]
 def draw_log(
     steps: Mapping[str, np.ndarray], changes: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
 ) -> Figure:
-    """Draws the time steps of each stream, and what several streams know.
+    """Draws the time steps of each stream, and quantities that several streams share.
 
     Args:
         steps: times of the readings by stream, s.
-        changes: by title, times and values of each stream.
+        changes: times and values of each stream, by title.
 
     Raises:
         ImportError: without matplotlib.

@@ -1,4 +1,4 @@
-"""The path of the belief, against the truth."""
+"""Plots the path of the belief and the true path."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_path"]
 
-MEMBERS, ELLIPSES = 32, 12  # that are drawn: the first ones; evenly over time
+MEMBERS, ELLIPSES = 32, 12  # number of drawn members (the first ones) and ellipses (evenly over time)
 
 
 def plot_path(
@@ -37,33 +37,33 @@ def plot_path(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draws the mean path with its spread, the true one and others, with one scale for both axes.
+    """Draws the mean path with its spread, the true path and others, with equal scales of both axes.
 
     Args:
         run: a roll-out or sequence of T steps with ``("belief", "mean")`` ``[T, S]`` or ``("belief", "ensemble")``
             ``[T, E, S]``; or means ``[T, S]``.
-        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
-        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
+        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out if it exists.
+        belief: key of the belief, such as a smoother's ``"smoothed"``.
         others: further paths by name, states ``[T', S']`` such as dead reckoning.
-        readings: of the drawn dimensions ``[T', 2]``, in the state's units, as dots; rows that are not finite are left
-            out, so hide what was not observed with NaN.
-        dims: of the state, the horizontal and the vertical axis; three of them draw in space.
+        readings: readings of the drawn dimensions ``[T', 2]``, in the state's units, drawn as dots; set missing ones to
+            NaN, as rows that are not finite are left out.
+        dims: dimensions of the state for the horizontal and the vertical axis; three give a 3-D plot.
         forward_up: draw a car's (x forward, y left) as a map that it drives up: ``-y`` to the right, ``x`` upwards.
         spread: ``"ensemble"`` draws the members' paths, ``"ellipses"`` draws ``level`` of a Gaussian at some steps;
-            ``"auto"`` takes members where they have equal weights, else ellipses where there is a covariance or a
-            variance. Particles have no paths of their own: resampling moves them to other rows.
+            ``"auto"`` takes members with equal weights, else ellipses if there is a covariance or a variance. Particles
+            have no continuous paths, as resampling reorders them.
         level: probability of an ellipse.
-        unit: of the coordinates.
-        legend: whether to add one above the Axes.
-        ax: to draw into; 3-D for three dims. ``None`` makes a figure.
+        unit: unit of the coordinates.
+        legend: whether to add a legend above the Axes.
+        ax: Axes to draw into; 3-D for three dims. ``None`` makes a figure.
 
     Returns:
-        The Axes. Lines carry labels; the ellipse of step t has the gid ``"step t"``.
+        The Axes. Lines have labels; the ellipse of step t has the gid ``"step t"``.
 
     Raises:
         ImportError: without matplotlib; the message names the extra.
-        KeyError: if the roll-out has no belief, or not the truth that was named.
-        ValueError: for more than one sequence, for shapes that do not fit, and for a spread that is not there.
+        KeyError: if the roll-out has no belief, or lacks the given truth.
+        ValueError: for more than one sequence, shapes that do not match, and a spread that the belief does not have.
         IndexError: if ``dims`` names no dimension.
 
     Example:
@@ -146,7 +146,7 @@ def _name(dim: int) -> str:
 
 
 def _draw_ellipses(axes: Axes, read: Belief, dims: list[int], forward_up: bool, level: float) -> None:
-    """Draws where a Gaussian lies with probability ``level``: half axes sqrt(-2 ln(1 - level)) standard deviations."""
+    """Draws the ellipses of probability ``level``: half axes are sqrt(-2 ln(1 - level)) standard deviations."""
     from matplotlib.patches import Ellipse
 
     if not 0 < level < 1:
@@ -169,7 +169,7 @@ def _draw_ellipses(axes: Axes, read: Belief, dims: list[int], forward_up: bool, 
 
 
 def _cube(axes: Any) -> None:
-    """Gives the three axes one span, so that a metre is a metre along each."""
+    """Gives the three axes the same span, for equal scales."""
     from matplotlib.ticker import MaxNLocator
 
     limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])

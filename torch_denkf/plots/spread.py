@@ -1,4 +1,4 @@
-"""Spread against error: does the filter know how wrong it is?"""
+"""Plots the error over the predicted spread."""
 
 from __future__ import annotations
 
@@ -35,29 +35,28 @@ def plot_spread_error(
 ) -> Axes:
     """Draws the root mean square error of the mean over the predicted spread, in bins of similar spread.
 
-    On the diagonal the filter knows how wrong it is; above it, it trusts itself too much.
+    On the diagonal the filter is calibrated; above it, overconfident.
 
     Args:
         run: roll-outs or sequences ``[*B]`` with ``("belief", "mean")`` ``[*B, S]`` and ``("belief", "var")`` or
             ``("belief", "ensemble")`` ``[*B, E, S]``. The spread of E members is scaled with sqrt((E+1)/E).
         truth: ``[*B, S']``, or its key; by default ``"state"`` of the roll-out.
-        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
+        belief: key of the belief, such as a smoother's ``"smoothed"``.
         dims: components to draw, a line each; all by default. They should have a similar size.
-        names: a label with its unit for each of them, such as ``"v, m/s"``.
-        factors: what each is multiplied with, such as ``180 / pi`` for degrees.
-        bins: points of a line, each for as many states.
-        space: whose points the states are; ``None`` for plain numbers. Components are then those of the tangent from
-            the mean to the truth: a rotation has three, about the body's axes, in degrees.
-        legend: whether to add one above the Axes.
-        ax: to draw into; ``None`` makes a figure.
+        names: label with unit of each component, such as ``"v, m/s"``.
+        factors: factor on each component, such as ``180 / pi`` for degrees.
+        bins: number of points of a line, each for equally many states.
+        space: space of the states; ``None`` for vectors. Components are then those of the tangent from the mean to the
+            truth: a rotation has three, about the body's axes, in degrees.
+        legend: whether to add a legend above the Axes.
+        ax: Axes to draw into; ``None`` makes a figure.
 
-    Returns:
-        The Axes: a line a component, then the diagonal.
+    Returns: The Axes: a line for each component, then the diagonal.
 
     Raises:
         ImportError: without matplotlib; the message names the extra.
-        KeyError: if the roll-out has no belief, or not the truth that was named.
-        ValueError: without a truth or a variance, for shapes that do not fit, and for fewer states than bins.
+        KeyError: if the roll-out has no belief, or lacks the given truth.
+        ValueError: without a truth or a variance, for shapes that do not match, and for fewer states than bins.
         IndexError: if ``dims`` names no dimension.
 
     Example:

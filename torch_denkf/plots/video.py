@@ -1,4 +1,4 @@
-"""Videos: frames to a file, and a belief that grows with time next to what the camera saw."""
+"""Videos: frames to a file, and a belief over time next to the camera's images."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ __all__ = ["belief_video", "write_video"]
 
 
 def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: float) -> Path:
-    """Writes frames one by one, so that only one is held in memory; needs no display.
+    """Writes frames one by one, with only one in memory; needs no display.
 
     Args:
-        file: ``.mp4`` is written by OpenCV as MPEG-4, ``.gif`` by pillow with 256 colours a frame. Its folder is made.
-        frames: pictures of one size, ``[H, W]``, ``[H, W, C]`` or ``[C, H, W]``, uint8 or floats in [0, 1]; see
-            :func:`belief_video` for C. Odd heights and widths of an MP4 grow by one row or column.
-        fps: frames a second; at most 50 for a GIF, whose times are hundredths of a second.
+        file: ``.mp4`` is written by OpenCV as MPEG-4, ``.gif`` by pillow with 256 colours per frame. Its folder is
+            created.
+        frames: images of one size, ``[H, W]``, ``[H, W, C]`` or ``[C, H, W]``, uint8 or floats in [0, 1]; see
+            :func:`belief_video` for C. For an MP4, odd heights and widths are padded by one row or column.
+        fps: frames per second; at most 50 for a GIF, whose times are hundredths of a second.
 
     Returns:
         The file.
@@ -37,7 +38,7 @@ def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: fl
         ImportError: for a GIF without pillow; the message names the extra.
         ValueError: for another ending, without frames, for frames of several sizes or other shapes, and for ``fps``
             out of range.
-        OSError: if the file cannot be written, as on a full disk; an earlier one is then as it was.
+        OSError: if the file cannot be written, as on a full disk; an existing file is then unchanged.
 
     Example:
         >>> import tempfile
@@ -51,7 +52,7 @@ def write_video(file: str | Path, frames: Iterable[Tensor | np.ndarray], fps: fl
         raise ValueError(f"a video ends with .mp4 or .gif; got {file.name!r}")
     if not fps > 0 or (file.suffix.lower() == ".gif" and fps > 50):
         raise ValueError(f"fps must be positive, and at most 50 for a GIF; got {fps}")
-    from torch_denkf.deployment.files import replacing  # its package brings the filters, and pictures need none
+    from torch_denkf.deployment.files import replacing  # imported here, as its package imports the filters
 
     with replacing(file) as beside:
         writers[file.suffix.lower()](beside, (as_picture(frame) for frame in frames), fps)
@@ -76,36 +77,36 @@ def belief_video(
     size: tuple[float, float] = (10, 5.6),
     dpi: float = 100,
 ) -> Path:
-    """Writes a video of one sequence: the camera, the path and the bands, growing with time.
+    """Writes a video of one sequence: the camera, the path and the bands over time.
 
-    Frames are drawn and written one by one. A red frame around the picture marks steps that were not observed.
+    Frames are drawn and written one by one. A red border of the image marks steps that were not observed.
 
     Args:
         file: ``.mp4`` or ``.gif``, see :func:`write_video`.
         run: a roll-out or sequence of T steps, see :func:`plot_path` and :func:`plot_bands`.
-        pixels: pictures ``[T, C, H, W]`` or ``[T, H, W, C]``, or their key; by default ``"pixels"`` of the roll-out
-            where it is there. One channel is grey, three are colours. Of more, as of a frame with its difference to the
-            one before, the first three are drawn, of two the first.
-        belief: which belief to draw, such as ``"smoothed"``, what a smoother wrote.
-        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out where it is there.
-        observed: ``[T, 1]`` bool, or its key; by default ``"observed"`` of the roll-out where it is there.
+        pixels: pictures ``[T, C, H, W]`` or ``[T, H, W, C]``, or their key; by default ``"pixels"`` of the roll-out if
+            it exists. One channel is grey, three are colours. Of more channels the first three are drawn, of two the
+            first.
+        belief: key of the belief, such as a smoother's ``"smoothed"``.
+        truth: ``[T, S']``, or its key; by default ``"state"`` of the roll-out if it exists.
+        observed: ``[T, 1]`` bool, or its key; by default ``"observed"`` of the roll-out if it exists.
         time: seconds of the steps ``[T]``, or the seconds between two; by default steps are counted.
         path: keywords of :func:`plot_path` for two dims, such as ``{"forward_up": True}``; ``None`` leaves it out.
         on_picture: whether to draw the path on the camera's picture; ``path`` may be left out. Its dims are then in
             pixels from the middle of the upper left one: the column to the right, then the row downwards.
         bands: keywords of :func:`plot_bands`, such as ``{"dims": [3, 4]}``; ``None`` leaves them out.
-        title: headline.
-        fps: frames a second; by default those of the sequence's own speed, 10 where ``time`` is not given.
-        every: draw every n-th step; the default of ``fps`` follows.
-        size: of a frame, width and height in inches.
-        dpi: pixels an inch.
+        title: title of the figure.
+        fps: frames per second; by default in real time, or 10 without ``time``.
+        every: draw every n-th step; the default of ``fps`` is adapted.
+        size: width and height of a frame in inches.
+        dpi: pixels per inch.
 
     Returns:
         The file.
 
     Raises:
         ImportError: without matplotlib or pillow; the message names the extra.
-        KeyError: if the roll-out lacks a key that was named.
+        KeyError: if the roll-out lacks a given key.
         ValueError: if there is nothing to draw, and for all errors of the functions above.
 
     Example:
@@ -146,7 +147,7 @@ def _panel_count(bands: Mapping[str, Any] | None, state_dim: int) -> int:
 
 
 def _own_speed(time: float | Tensor | None, every: int) -> float:
-    """Returns frames a second at which the sequence goes by as fast as it did."""
+    """Returns the frames per second for real time."""
     if time is None:
         return 10.0 / every
     dt = float(torch.as_tensor(time).flatten().diff().median()) if isinstance(time, Tensor) else time

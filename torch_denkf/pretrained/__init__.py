@@ -1,4 +1,4 @@
-"""Trained filters that come with the library, and folders of your own: weights as data, built from plain numbers."""
+"""Pretrained filters, and saved filters in folders: weights as data, and settings in JSON."""
 
 import lazy_loader
 

@@ -17,7 +17,7 @@ __all__ = ["available", "from_pretrained", "save_pretrained"]
 
 
 def available() -> list[str]:
-    """Names of the filters that come with the library, for :func:`from_pretrained`.
+    """Returns names of the pretrained filters, for :func:`from_pretrained`.
 
     Example:
         >>> available()
@@ -29,25 +29,25 @@ def available() -> list[str]:
 def from_pretrained(
     name_or_folder: str | Path, *, builders: Mapping[str, Callable[..., Filter]] | None = None
 ) -> Filter:
-    """Loads a trained filter: one that comes with the library, or one that was saved to a folder; without downloads.
+    """Loads a trained filter by name, or from a folder; without downloads.
 
-    The weights are data only, the filter is built by a function of this library from the numbers in ``config.json``,
-    and the weights' SHA-256 is compared with the one that stands there: no code of a file is executed.
+    The weights are data only, the filter is built by a function of this library from the settings in ``config.json``,
+    and the weights' SHA-256 is compared with that in ``config.json``: no code of a file is executed.
 
     Args:
-        name_or_folder: one of :func:`available`, or a folder that :func:`save_pretrained` or ``denkf train`` left.
+        name_or_folder: one of :func:`available`, or a folder of :func:`save_pretrained` or ``denkf train``.
         builders: functions of your own by the name that ``config.json`` gives as ``"builder"``. A filter that
             :func:`save_pretrained` wrote with ``builder=still`` needs ``builders={"still": still}`` here, because the
             folder holds the function's name and not its code.
 
     Returns:
-        The filter, on the CPU, in evaluation mode; ``filter.settings`` are its numbers: a dataclass of its own, or the
-        arguments of its builder by name.
+        The filter, on the CPU, in evaluation mode; ``filter.settings`` are its settings: a dataclass, or the arguments
+        of its builder by name.
 
     Raises:
         FileNotFoundError: if there is no filter of that name and no such folder, or the weights are missing.
         TypeError: if ``name_or_folder`` is neither text nor a path.
-        ValueError: if a file is damaged, changed, of another format, or does not fit the other; the message names it.
+        ValueError: if a file is damaged, changed, of another format, or does not match the other; the message names it.
 
     Example:
         >>> from_pretrained("car-odometry").settings.dt
@@ -83,29 +83,27 @@ def save_pretrained(
 ) -> Path:
     """Writes a filter to a folder that :func:`from_pretrained` reads.
 
-    The filter is built again from its settings, and compared with the one that is to be stored: numbers of members,
-    keys, schemes, shapes, whatever does not come back with the weights. Where the two differ, nothing is written.
+    The filter is built again from its settings, and compared with the given one: ensemble size, keys, schemes, shapes,
+    all that the weights do not determine. If they differ, nothing is written.
 
     Args:
-        model: one that a function of this library built from settings, such as
-            :func:`torch_denkf.applications.car.odometry.filter.car_filter`. For another one pass ``builder`` and
+        model: filter of a builder of this library, such as
+            :func:`torch_denkf.applications.car.odometry.filter.car_filter`. For other filters pass ``builder`` and
             ``settings``.
-        folder: gets ``weights.safetensors`` and ``config.json``; a filter in it is replaced.
-        training: command, seed, data: plain values, for the record alone.
+        folder: destination of ``weights.safetensors`` and ``config.json``; existing files are overwritten.
+        training: command, seed, data: plain values, as a record only.
         card: text of ``card.md``, for people: data, command, scores, limits, licence.
-        builder: your function of the settings that builds such a filter. The folder holds its name alone: pass the
-            function to :func:`from_pretrained`, too.
-        settings: its arguments, plain values.
+        builder: your function of the settings that builds such a filter. Only its name is saved: pass the function to
+            :func:`from_pretrained`, too.
+        settings: arguments of ``builder``, plain values.
 
     Returns:
         The folder.
 
     Raises:
-        ValueError: if it is not known what builds the filter, or another filter is built; the message names what
-            differs.
+        ValueError: if the builder is unknown, or builds another filter; the message names the difference.
         OSError: if the folder cannot be written to.
-        TypeError: if ``training`` or ``settings`` hold what JSON does not know, or ``builder`` is no function with a
-            name.
+        TypeError: if ``training`` or ``settings`` are not JSON-serialisable, or ``builder`` is no function with a name.
 
     Example:
         >>> import tempfile, torch

@@ -1,4 +1,4 @@
-"""Smoothers: what later readings say about earlier states, on top of any filter."""
+"""Smoothers: correct earlier states by later readings, on top of any filter."""
 
 from torch_denkf.smoothers.ensemble import EnKS, EnRTS
 from torch_denkf.smoothers.fixed_lag import FixedLag

@@ -1,4 +1,4 @@
-"""One base for all smoothers of sequences: filter, see which elements follow each other, smooth."""
+"""Base class of all smoothers of sequences: runs the filter, finds consecutive elements, and smooths."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ __all__ = ["Smoother"]
 
 
 class Smoother(Checked, TensorDictModuleBase):
-    """Filters a sequence ``[*B, T]``, then says what each state looks like given what came later.
+    """Filters a sequence ``[*B, T]``, then corrects each state by the later readings.
 
-    It writes all that the filter writes, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
-    ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` where there is one. At a time t that is the belief of the
-    state *of t*, given the readings up to t + lag. (:class:`FixedLag` writes at t the belief of t - lag.) Nothing
-    flows back over the border of an episode or a slice: those that :meth:`Filter.sequence` heeds. The gradient flows
+    It writes all outputs of the filter, and ``("smoothed", "mean")`` and ``("smoothed", "var")`` ``[*B, T, S]``, with
+    ``("smoothed", "cov")`` or ``("smoothed", "ensemble")`` if the belief has one. The entry at time t is the belief of
+    the state *at t*, given the readings up to t + lag. (:class:`FixedLag` writes at t the belief of t - lag.) No
+    correction crosses the boundary of an episode or a slice, as found by :meth:`Filter.sequence`. Gradients flow
     through filter and smoother.
 
-    A subclass writes :meth:`_smooth`, and :meth:`_extended` where the filter must say more than it does by itself.
+    A subclass implements :meth:`_smooth`, and :meth:`_extended` if the filter needs further outputs.
 
     Args:
         filter: the filter; its parameters are the smoother's.
-        lag: how many later readings count; ``None`` for all that there are (fixed interval).
-        needed: keys of the filter's output that the smoother needs.
-        written: last names of what it writes.
+        lag: number of later readings; ``None`` for all of the sequence (fixed interval).
+        needed: outputs of the filter that the smoother needs.
+        written: last names of the smoother's outputs.
 
     Raises:
         ValueError: if ``lag`` is negative.
     """
 
-    #: Whether the filter that runs depends on the lag; without one, then on the sequence's length.
+    #: Whether the filter depends on the lag, or for ``lag=None`` on the sequence's length.
     _by_lag = False
 
     def __init__(self, filter: Filter, lag: int | None, needed: Iterable[NestedKey], written: Iterable[str]):
@@ -59,19 +59,19 @@ class Smoother(Checked, TensorDictModuleBase):
     def sequence(
         self, tensordict: TensorDictBase, *, detach_every: int | None = None, keep: Sequence[NestedKey] | None = None
     ) -> TensorDictBase:
-        """Filters and smooths ``[*B, T]``; takes what :meth:`Filter.sequence` takes.
+        """Filters and smooths ``[*B, T]``; its arguments are those of :meth:`Filter.sequence`.
 
         Args:
             tensordict: frames, see there.
-            detach_every: truncates back-propagation through the filter's time; what flows back from later states does
-                not stop there.
-            keep: the filter's outputs to write besides the smoothed belief; all by default.
+            detach_every: truncates back-propagation through the filter's time; gradients through the smoother's
+                backward pass are not truncated.
+            keep: outputs of the filter to write in addition to the smoothed belief; all by default.
 
         Returns:
             ``tensordict``, with the outputs.
 
         Raises:
-            ValueError: if there is no time dimension, no step, or ``keep`` names what the filter does not write.
+            ValueError: if there is no time dimension, no step, or the filter does not write a key in ``keep``.
             KeyError: if an entry is missing.
         """
         keep = list(self.filter.out_keys) if keep is None else list(keep)
@@ -80,7 +80,7 @@ class Smoother(Checked, TensorDictModuleBase):
         filter = self._filter_for(rows.batch_size[-1] if rows.ndim else 0)
         filtered = filter.sequence(rows.copy(), detach_every=detach_every, keep=wanted)
         out = filter.inside(filtered)
-        # A step from the element before: not from a stored belief, as where a slice of a policy's data begins.
+        # Elements one step on from the element before, but not from a stored belief, as at the start of a slice.
         follows = self.filter.stepped(rows)
         if new is not None:
             follows = follows & ~new.reshape(rows.batch_size)
@@ -91,13 +91,13 @@ class Smoother(Checked, TensorDictModuleBase):
         return tensordict
 
     def stepped(self, tensordict: TensorDictBase) -> Tensor:
-        """Marks the elements that a step led to, see :meth:`Filter.stepped`."""
+        """Marks the elements that are results of a step, see :meth:`Filter.stepped`."""
         return self.filter.stepped(tensordict)
 
     def _filter_for(self, count: int) -> Filter:
-        """Returns the filter that runs on sequences of ``count`` steps; made again where a module has been replaced."""
+        """Returns the filter for sequences of ``count`` steps, rebuilt if a module has been replaced."""
         own = self.lag if self.lag is not None else max(count - 1, 1)
-        lag = own if self._by_lag else None  # another filter would compile anew
+        lag = own if self._by_lag else None  # another filter would compile again
         if self._running[0] != lag or self._running[1] is not self.filter.structure:
             self._running = (lag, self.filter.structure, self._extended(lag))
         filter, compiled = self._running[2], self.filter.compiled
@@ -106,22 +106,22 @@ class Smoother(Checked, TensorDictModuleBase):
         return filter
 
     def _extended(self, lag: int | None) -> Filter:
-        """Returns the filter, or one of the same modules that also writes what the smoother needs."""
+        """Returns the filter, or one of the same modules that also writes the smoother's inputs."""
         return self.filter
 
     def _smooth(self, entries: Entries, follows: Tensor, out: TensorDictBase) -> tuple[Tensor, ...]:
         """Returns the smoothed belief, in the order of ``smoothed_keys``.
 
         Args:
-            entries: ``[*B, T, ...]``, what is read and what the filter wrote.
-            follows: which elements are a step on from those before them, ``[*B, T]``; the first is not read.
+            entries: ``[*B, T, ...]``, inputs and outputs of the filter.
+            follows: elements that are one step on from the element before, ``[*B, T]``; the first is ignored.
             out: the same as a tensordict.
         """
         raise NotImplementedError
 
 
 def last_of_runs(follows: Tensor) -> Tensor:
-    """Returns the last index of each element's run of elements that follow each other, ``[*B, T]``.
+    """Returns the last index of each element's run of consecutive elements, ``[*B, T]``.
 
     Example:
         >>> last_of_runs(torch.tensor([False, True, False, True, True])).tolist()
@@ -131,5 +131,5 @@ def last_of_runs(follows: Tensor) -> Tensor:
     ends = torch.ones_like(follows)
     ends[..., :-1] = ~follows[..., 1:]
     index = torch.arange(count, device=follows.device).expand(follows.shape)
-    # Of the ends at or after each element the first: a running minimum from behind.
+    # The first end at or after each element: a running minimum in reverse order.
     return torch.where(ends, index, count).flip(-1).cummin(-1).values.flip(-1)

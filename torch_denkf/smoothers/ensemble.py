@@ -17,22 +17,22 @@ __all__ = ["EnKS", "EnRTS"]
 
 
 class EnRTS(Smoother):
-    """Ensemble Rauch-Tung-Striebel smoother: one pass back over what the filter wrote.
+    """Ensemble Rauch-Tung-Striebel smoother: one backward pass over the outputs of the filter.
 
-    The gain of each step back is a regression of members on their own forecasts. It asks nothing of the analysis, and
-    costs about as much as the filter's analysis. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and
-    ``var``, see :class:`Smoother`.
+    The gain of each backward step is a regression of members on their own forecasts. It is independent of the analysis,
+    and costs about as much as one. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and ``var``,
+    see :class:`Smoother`.
 
     Args:
-        filter: an ensemble filter. Its analysis must keep members in their places: not ``rotate=True``.
-        lag: how many later readings count; ``None`` for all.
-        damping: factor on each gain, 1 by default. A filter with inflation needs one below 1 / inflation, see
+        filter: an ensemble filter whose analysis keeps the order of members: not ``rotate=True``.
+        lag: number of later readings; ``None`` for all.
+        damping: factor of each gain, 1 by default. A filter with inflation needs one below 1 / inflation, see
             :func:`~torch_denkf.functional.smoothing.ensemble.enrts_step`.
 
     Raises:
         TypeError: for a filter without an ensemble.
-        ValueError: for one whose analysis rotates its members: the forecast of a member is then no longer its own; for
-            one with inflation, without a damping; or for a damping that is not in (0, 1].
+        ValueError: if the analysis rotates its members, so that members and forecasts are no longer paired; if the
+            filter has inflation and there is no damping; or if the damping is not in (0, 1].
 
     Reference:
         Raanes, "On the ensemble Rauch-Tung-Striebel smoother and its equivalence to the ensemble Kalman smoother",
@@ -51,47 +51,47 @@ class EnRTS(Smoother):
         prefix = prefix_of(filter, "ensemble", self)
         if any(getattr(part, "rotate", False) for part in in_role(filter, SubModel)):
             raise ValueError(
-                "An analysis with rotate=True gives each member another's place, so that EnRTS cannot tell what a "
-                "member's forecast was. Turn the rotation off, or use EnKS, which rotates the past as well."
+                "An analysis with rotate=True mixes the members, so that EnRTS cannot pair a member with its "
+                "forecast. Turn the rotation off, or use EnKS, which also rotates the lag window."
             )
         keys = [(prefix, "ensemble"), filter.structure.forecast_of[prefix, "ensemble"]]
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
         if damping is not None:
-            check_number("damping", damping, above=0, most=1, cure="It is a factor on each gain")
+            check_number("damping", damping, above=0, most=1, cure="It is a factor of each gain")
         self.damping = damping
         self._check_inflation()
 
     def _smooth(self, entries, follows, out):
-        self._check_inflation()  # it may have been set since
+        self._check_inflation()  # it may have been changed
         values, damping = (entries[key] for key in self._needed), 1.0 if self.damping is None else self.damping
         space = self.filter.structure.space
         ensemble = enrts_smooth(*values, follows=follows, lag=self.lag, damping=damping, space=space)
         return ensemble, *moments_of(ensemble, None, space)
 
     def _check_inflation(self) -> None:
-        """Raises where gains would carry an inflation back, and nobody said how to damp it."""
+        """Raises if gains would carry an inflation back without a damping."""
         for part in in_role(self.filter, SubModel) if self.damping is None else ():
             for name, none in (("inflation", 1.0), ("adapt_inflation", 0.0)):
                 value = getattr(part, name, none)
                 if value > none:
                     raise ValueError(
                         f"{type(part).__name__} has {name}={value:g}, which the gains of EnRTS would carry back, so "
-                        f"that the spread grows in each step. Say damping=..., a factor below 1 / inflation on each "
-                        "gain; or take EnKS or FixedLag, which leave inflation out of the past"
+                        f"that the spread grows in each step. Pass damping=..., a factor of each gain below 1 / "
+                        "inflation; or use EnKS or FixedLag, which do not inflate the lag window"
                     )
 
 
 class EnKS(Smoother):
-    """Ensemble Kalman smoother: each analysis corrects the members of the past L steps, too.
+    """Ensemble Kalman smoother: each analysis also corrects the members of a lag window of L steps.
 
-    It is :class:`FixedLag`, put into the order of a recording. Random rotations of the members turn the past as well,
-    so that pairs stay pairs. Where the lag is that of the whole sequence, memory grows with its square: take
+    It is :class:`FixedLag`, with outputs in the order of a recording. Random rotations also rotate the lag window, so
+    that members stay paired. If the lag is the whole sequence, memory grows with the square of its length: use
     :class:`EnRTS` for long recordings. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, ``mean`` and ``var``,
     see :class:`Smoother`.
 
     Args:
         filter: an ensemble filter, see :class:`FixedLag`.
-        lag: how many later readings count; ``None`` for all.
+        lag: number of later readings; ``None`` for all.
 
     Raises:
         TypeError: for another filter.
@@ -114,7 +114,7 @@ class EnKS(Smoother):
         self.prefix = prefix_of(filter, "ensemble", self)
         keys = [(self.prefix, "ensemble")] + [(self.prefix, "past")] * (lag != 0)
         super().__init__(filter, lag, keys, ("ensemble", "mean", "var"))
-        self._filter_for(2)  # raises for modules that cannot have a lag
+        self._filter_for(2)  # raises for modules that do not support a lag
 
     def _extended(self, lag):
         return FixedLag(self.filter, lag) if lag else self.filter
@@ -128,15 +128,15 @@ class EnKS(Smoother):
 
 
 def of_own_time(ensemble: Tensor, past: Tensor, follows: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the members of each time as they are L steps later, or at the end of their episode.
+    """Returns the members of each time as corrected L steps later, or at the end of their episode.
 
     Args:
         ensemble: ``[*B, T, E, S]``.
-        past: at each time that of the L times before, ``[*B, T, E, L, S]``.
+        past: at each time the members of the L times before, ``[*B, T, E, L, S]``.
         follows: ``[*B, T]``, see :class:`Smoother`.
 
     Returns:
-        The members ``[*B, T, E, S]``, and the time at which they are so, ``[*B, T]``.
+        The members ``[*B, T, E, S]``, and the time of their last correction, ``[*B, T]``.
     """
     batch, (count, lag) = ensemble.shape[:-3], (ensemble.shape[-3], past.shape[-2])
     now = torch.arange(count, device=ensemble.device)

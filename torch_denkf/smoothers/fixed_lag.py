@@ -1,4 +1,4 @@
-"""Fixed-lag smoothing online: any filter, with its last states next to its belief."""
+"""Fixed-lag smoothing online: adds a lag window to the belief of any filter."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ __all__ = ["FixedLag", "kind_of", "prefix_of"]
 class FixedLag(Filter):
     """A filter that also writes, at each step, the smoothed belief of the state L steps ago.
 
-    The belief of t is the filter's own. Next to it stand ``("smoothed", "mean")`` and ``("smoothed", "var")``,
-    ``[*B, S]``, of the state at t - L, given all readings up to t, and ``("smoothed", "age")`` ``[*B, 1]``: by how many
-    steps that state lies back, which is L, or fewer where the episode is younger. How it is done follows from the
+    The belief of t is the filter's own. Further outputs are ``("smoothed", "mean")`` and ``("smoothed", "var")``,
+    ``[*B, S]``, of the state at t - L, given all readings up to t, and ``("smoothed", "age")`` ``[*B, 1]``, the number
+    of steps since that state, which is L, or fewer in an episode that is younger. The method depends on the
     belief:
 
     =====================  ========================================================================  ==================
     belief                 smoother                                                                  further entries
     =====================  ========================================================================  ==================
-    ensemble               ensemble Kalman smoother: each analysis corrects the past's members, too  ``ensemble``
+    ensemble               ensemble Kalman smoother: each analysis also corrects the lag window      ``ensemble``
     mean and covariance    Rauch-Tung-Striebel, forward in time                                      ``cov``
     particles              their ancestors, with the present weights (Kitagawa 1996)                 ``ensemble``
     =====================  ========================================================================  ==================
 
     It is a :class:`~torch_denkf.filters.Filter` itself: steps, sequences, masks, resets, policies, transforms, replay
-    buffers and compiled steps work as with any other, and the gradient goes through it. The past is part of what it
-    carries. Its modules are the filter's own, not copies. To smooth recordings, where what is later is there already,
+    buffers and compiled steps work as with any other, and gradients pass through it. The lag window is part of the
+    carry. Its modules are the filter's own, not copies. To smooth recordings, in which later readings are known,
     use :class:`EnKS`, :class:`EnRTS`, :class:`RTSSmoother` or :class:`ParticleSmoother`.
 
     Args:
@@ -99,12 +99,12 @@ class FixedLag(Filter):
         """Filters a sequence, see :meth:`Filter.sequence`.
 
         Raises:
-            KeyError: if the data hold beliefs that were stored without their past.
+            KeyError: if the data have beliefs that were stored without their lag window.
         """
         lacking = [key for key in self.carry_keys if tensordict.get(key, None) is None]
         if lacking and all(tensordict.get(key, None) is not None for key in self._without_lag):
             raise KeyError(
-                f"The data hold {self._without_lag}, from which a filter would go on, but not {lacking}: they were "
+                f"The data have {self._without_lag}, from which a filter would continue, but not {lacking}: they were "
                 "stored without a lag. Leave them out: tensordict.exclude(*filter.belief_keys)."
             )
         return super().sequence(tensordict, detach_every=detach_every, keep=keep)
@@ -124,8 +124,8 @@ def kind_of(filter: Filter) -> tuple[str, str]:
         names = {key[1] for key in carry if key[0] == prefix}
         if names & {"past", "past_mean", "joint_mean"}:
             raise TypeError(
-                "This filter carries a past already, as FixedLag, IEnKS and FusedFilter with a delay do. Give the "
-                "filter inside of it. A FusedFilter with a delay writes ('smoothed', 'mean') itself, lag= steps back."
+                "This filter already carries a lag window, as FixedLag, IEnKS and FusedFilter with a delay do. Pass "
+                "the filter inside it. A FusedFilter with a delay writes ('smoothed', 'mean') itself, lag= steps back."
             )
         if {"ensemble", "log_weight"} <= names and isinstance(transition, ResampledTransition):
             return "particles", prefix
@@ -135,7 +135,7 @@ def kind_of(filter: Filter) -> tuple[str, str]:
             return "ensemble", prefix
     raise TypeError(
         f"{type(filter).__name__} carries {filter.carry_keys}; smoothing needs an ensemble, a mean and a covariance, "
-        "or particles with log-weights behind a ResampledTransition."
+        "or particles with log-weights and a ResampledTransition."
     )
 
 
@@ -143,7 +143,7 @@ def prefix_of(filter: Filter, kind: str, owner: object) -> str:
     """Returns the prefix of the belief's entries.
 
     Raises:
-        TypeError: for a filter whose belief is of another kind than its smoother, ``owner``, takes.
+        TypeError: for a filter whose kind of belief its smoother, ``owner``, does not support.
     """
     found, prefix = kind_of(filter)
     if found != kind:
@@ -155,10 +155,10 @@ def prefix_of(filter: Filter, kind: str, owner: object) -> str:
 
 
 def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> OrderedDict[str, TensorDictModuleBase]:
-    """Modules whose analyses correct the past, too; also those inside plain sequences.
+    """Returns the modules with analyses that also correct the lag window; also analyses in plain sequences.
 
     Raises:
-        TypeError: if there is no analysis of an ensemble among them, or one that cannot.
+        TypeError: if there is no ensemble analysis among them, or one does not support a lag window.
     """
     found = False
 
@@ -168,10 +168,10 @@ def _with_lagged_analyses(modules: Mapping[str, TensorDictModuleBase]) -> Ordere
             return TensorDictSequential(OrderedDict((name, changed(part)) for name, part in named_modules_of(module)))
         if role(module, Update).info_prefix is not None:
             found = True
-            return lagged(module)  # raises for what it cannot wrap
+            return lagged(module)  # raises if it cannot wrap the module
         return module
 
     out = OrderedDict((name, changed(module)) for name, module in modules.items())
     if not found:
-        raise TypeError("There is no EnsembleAnalysis among the filter's modules, so a lag has nothing to learn from.")
+        raise TypeError("There is no EnsembleAnalysis among the filter's modules, so nothing can correct a lag window.")
     return out

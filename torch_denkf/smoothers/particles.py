@@ -1,4 +1,4 @@
-"""Smoothers of particle filters: new weights by the motion's density, or the ancestors of later particles."""
+"""Smoothers of particle filters, which reweight particles by the motion's density."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from torch_denkf.submodel import Call, Entries
 
 __all__ = ["ParticleSmoother"]
 
-_STILL = 1e-12  # variance in the place of none
+_STILL = 1e-12  # replaces a variance of zero
 
 
 class ParticleSmoother(Smoother):
-    r"""Backward weights of a particle filter: the particles stay, those that lead to what came later count for more.
+    r"""Backward smoothing of particles: ancestors of likely later particles gain weight; no particle moves.
 
     It needs the density of the motion, :math:`p(x_{t+1} | x_t)`, and so a
-    :class:`~torch_denkf.modules.NoisyTransition` with noise in every dimension, added after a motion that is
-    deterministic. Each step costs E² densities. For other motions :class:`FixedLag` follows the ancestors of the
-    particles, which a long lag leaves few of. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, the filter's
-    particles, their ``log_weight`` ``[*B, T, E]``, ``mean`` and ``var``, see :class:`Smoother`.
+    :class:`~torch_denkf.modules.NoisyTransition` with noise in every dimension, added after a deterministic motion.
+    Each step computes E² densities. For other motions :class:`FixedLag` follows the ancestors of the
+    particles, of which few remain after a long lag. It writes ``("smoothed", "ensemble")`` ``[*B, T, E, S]``, the
+    filter's particles, their ``log_weight`` ``[*B, T, E]``, ``mean`` and ``var``, see :class:`Smoother`.
 
-    On a space the density is a Gaussian's of the tangent from where the motion leads to the later particle. That is
-    right where the noise of a step is small against a turn.
+    On a space the density is Gaussian in the tangent from the forecast particle to the later one. That is
+    accurate if the noise of a step is small compared with a full turn.
 
     Args:
         filter: a particle filter.
-        lag: how many later readings count; ``None`` for all.
+        lag: number of later readings; ``None`` for all.
 
     Raises:
         TypeError: for another filter, or a motion without a density.
@@ -84,7 +84,7 @@ class ParticleSmoother(Smoother):
         return particles, smoothed, *moments_of(particles, smoothed, self.filter.structure.space)
 
     def _densities(self, entries: Entries, particles: Tensor, log_weights: Tensor) -> Tensor:
-        """Returns log-densities of particles at t (columns), given those at t − 1 (rows), ``[*B, T, E, E]``."""
+        """Returns log-densities of particles at t (columns) given particles at t − 1 (rows), ``[*B, T, E, E]``."""
         motion, structure = self.filter.transition_module.module, self.filter.structure
         space = structure.space
         key, out_key = unravel_key(motion.in_keys[0]), unravel_key(motion.out_keys[0])
@@ -99,7 +99,7 @@ class ParticleSmoother(Smoother):
         def mean(members: Tensor) -> Tensor:
             return weighted_mean(members, weights) if space is None else space.mean(members, weights.exp())
 
-        # A step reads the belief before it, the action that led out of there, and what else there is at its own time.
+        # A step reads the belief before it, the action at the time of that belief, and other entries of its own time.
         work = {name: after(value) for name, value in entries.items() if value.ndim > time}
         work.update({name: before(entries[name]) for name in structure.belief if name in entries})
         work.update({name: after(value) for name, value in controls_of(structure, entries, time).items()})
@@ -115,22 +115,22 @@ class ParticleSmoother(Smoother):
 
 
 def log_density_of_pairs(values: Tensor, means: Tensor, cov: Tensor, space: Space | None = None) -> Tensor:
-    """Returns the log-density N(value; mean, cov) of each value, in the columns, around each mean, in the rows.
+    """Returns the log-density N(value; mean, cov) of each value (columns) around each mean (rows).
 
     Args:
         values: ``[*B, E, S]``.
         means: ``[*B, E, S]``.
-        cov: one for all pairs, ``[*B, S, S]``.
-        space: whose points values and means are; the density is of the tangents between them.
+        cov: the covariance for all pairs, ``[*B, S, S]``.
+        space: space of values and means; the density is of the tangents between them.
 
     Returns:
-        The log-densities, ``[*B, E, E]``; NaN where ``cov`` is not positive definite.
+        The log-densities, ``[*B, E, E]``; NaN if ``cov`` is not positive definite.
 
     Example:
         >>> log_density_of_pairs(torch.zeros(1, 2), torch.zeros(1, 2), torch.eye(2))
         tensor([[-1.8379]])
     """
-    moved = cov.diagonal(dim1=-2, dim2=-1)  # without noise, as in a step of no length, a value is its own mean
+    moved = cov.diagonal(dim1=-2, dim2=-1)  # without noise, as in a step of zero duration, a value equals its mean
     factor = cholesky(cov + torch.where(moved == 0, _STILL, 0.0).to(cov.dtype).diag_embed())
     if space is None:
         white = [torch.linalg.solve_triangular(factor, value.mT, upper=False).mT for value in (values, means)]

@@ -1,10 +1,10 @@
-r"""A filter that also carries its last L states, which each new reading corrects: the parts of fixed-lag smoothing.
+r"""Parts of fixed-lag smoothing: a filter also carries its last L states, which each new reading corrects.
 
 :class:`torch_denkf.smoothers.FixedLag` puts them into a filter. The order of a step is
 
-    transition -- past (moves on by one) -- observation, analysis (of present and past) -- lagged belief
+    transition -- past (shifted by one) -- observation, analysis (of present and past) -- lagged belief
 
-The past of the first steps of an episode is the episode's first state.
+In the first steps of an episode the lag window has copies of the episode's first state.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch_denkf.submodel import Entries, Initial, SubModel, Update, role
 __all__ = ["ENSEMBLE_PAST", "EnsemblePast", "LaggedAnalysis", "LaggedBelief", "Past", "lagged", "with_past"]
 
 
-#: The pasts of the members on their way through a step, and how old what is smoothed is.
+#: Keys of the members' lag window within a step, and of the age of the smoothed state.
 PAST_KEY, AGE_KEY = ("forecast", "past"), ("smoothed", "age")
 
 
@@ -35,10 +35,10 @@ class Past(NamedTuple):
 
     Attributes:
         carried: last names of the entries.
-        follow: last names of what follows from these, of the state L steps ago.
-        copies: the entries at the start of an episode, from the prefix of the belief, L, and the belief.
-        oldest: what follows, from the prefix, L, and the entries that are carried on.
-        present: last names of the belief's entries that follow from those that are carried, too, before the oldest's.
+        follow: last names of entries computed from these, for the state L steps ago.
+        copies: returns the entries at the start of an episode, from the prefix of the belief, L, and the belief.
+        oldest: returns the ``follow`` entries, from the prefix, L, and the carried entries.
+        present: last names of further entries of the belief computed from the carried ones, before the oldest's.
     """
 
     carried: tuple[str, ...]
@@ -51,15 +51,15 @@ class Past(NamedTuple):
 def with_past(
     initial: TensorDictModuleBase, lag: int, past: Past, *, age: int = 0, belief_prefix: str = "belief"
 ) -> AugmentedBelief:
-    """Returns an initial belief with a past: L copies of its state.
+    """Returns an initial belief with a lag window: L copies of its state.
 
     Args:
         initial: the initial belief.
         lag: L.
         past: ``ENSEMBLE_PAST``, ``MOMENTS_PAST`` or ``JOINT_PAST``.
-        age: steps between the first belief of an episode and the first state: 0, or -1 where that belief is yet to be
+        age: steps between the first belief of an episode and the first state: 0, or -1 if that belief is still to be
             updated with its own frame.
-        belief_prefix: prefix of what ``initial`` writes, and of the past.
+        belief_prefix: prefix of the outputs of ``initial``, and of the lag window.
 
     Raises:
         ValueError: if ``lag`` is not positive.
@@ -71,7 +71,7 @@ def with_past(
         >>> start(TensorDict({}))["belief", "past"].shape
         torch.Size([4, 3, 1])
     """
-    check_count("lag", lag, cure="It counts the steps to look back")
+    check_count("lag", lag, cure="It is the number of steps to look back")
     space = role(initial, Initial).space
     return AugmentedBelief(
         initial,
@@ -96,12 +96,12 @@ def _oldest(prefix: str, lag: int, entries: Entries, *, space: Space | None = No
     return ensemble, *moments_of(ensemble, entries.get((prefix, "log_weight")), space)
 
 
-#: The members of the past, ``[*B, E, L, S]``, the latest first, of an ensemble or of particles with log-weights.
+#: The members of the lag window, ``[*B, E, L, S]``, the latest first, of an ensemble or of particles with log-weights.
 ENSEMBLE_PAST = Past(("past",), ("ensemble", "mean", "var"), _copies, _oldest)
 
 
 class EnsemblePast(SubModel):
-    """The past moves on by one step: the last belief becomes its latest state, the oldest is forgotten.
+    """Shifts the lag window by one step: the last belief becomes its latest state, the oldest is dropped.
 
     Args:
         belief_prefix: prefix of ``ensemble`` ``[*B, E, S]`` and ``past`` ``[*B, E, L, S]``, the latest first.
@@ -117,21 +117,21 @@ class EnsemblePast(SubModel):
         super().__init__(nn.Identity(), [(belief_prefix, "ensemble"), (belief_prefix, "past")], [PAST_KEY])
 
     def compute(self, ensemble, past):
-        """Returns the past."""
+        """Returns the lag window."""
         return torch.cat([ensemble.unsqueeze(-2), past[..., :-1, :]], -2)
 
 
 class LaggedAnalysis(Around):
-    """An analysis that corrects the past with the same reading, by the past's covariance with the prediction.
+    """Corrects the lag window with the same reading, by its covariance with the predicted observation.
 
-    It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The past is neither inflated nor relaxed.
+    It is the ensemble Kalman smoother (Evensen & van Leeuwen 2000). The lag window is neither inflated nor relaxed.
 
     Args:
-        analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, or one of your own that updates an
-            ensemble; its keys and its noise are kept.
+        analysis: :class:`EnsembleAnalysis`, :class:`LocalEnsembleAnalysis`, or your own ensemble update; its keys and
+            noise are kept.
 
     Raises:
-        TypeError: for another analysis, which does not say what it does to other states.
+        TypeError: if the analysis cannot correct earlier states.
 
     Example:
         >>> from tensordict import TensorDict
@@ -149,16 +149,16 @@ class LaggedAnalysis(Around):
     def __init__(self, analysis: Update):
         if not (isinstance(analysis, Update) and analysis.updates_ensemble):
             raise TypeError(
-                f"{type(analysis).__name__} does not say what a reading means for earlier states. A lag needs an "
-                "EnsembleAnalysis, a LocalEnsembleAnalysis, or one of your own whose in_keys begin with the ensemble, "
-                "its predicted_key and its reading_keys; smooth other ensembles with EnRTS."
+                f"{type(analysis).__name__} cannot correct earlier states. A lag needs an EnsembleAnalysis, a "
+                "LocalEnsembleAnalysis, or your own analysis whose in_keys begin with the ensemble, its predicted_key "
+                "and its reading_keys; smooth other ensembles with EnRTS."
             )
         super().__init__(analysis, out_keys=[*analysis.out_keys, PAST_KEY], further_keys=[PAST_KEY])
 
     updates_ensemble = True
 
     def on_entries(self, entries, call):
-        """Returns the belief, the diagnostics, and the past."""
+        """Returns the belief, the diagnostics, and the lag window."""
         return self.on_aligned(self.aligned(entries), call)
 
     def aligned(self, entries):
@@ -175,10 +175,10 @@ class LaggedAnalysis(Around):
 
 
 def lagged(analysis: Update) -> Update:
-    """Extends an analysis to correct the past, too; inside of what goes around it, such as a gate.
+    """Extends an analysis to also correct the lag window; in wrappers such as a gate, the analysis inside.
 
     Raises:
-        TypeError: if it does not say what it does to other states.
+        TypeError: if it cannot correct earlier states.
     """
     if isinstance(analysis, Around):
         return analysis.around(lagged(analysis.module))
@@ -188,13 +188,13 @@ def lagged(analysis: Update) -> Update:
 class LaggedBelief(SubModel):
     """Writes the posterior of the state L steps ago, given all readings up to now, under ``"smoothed"``.
 
-    There stand ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``, and ``age`` ``[*B, 1]``: by how many
-    steps the state lies back, L, or fewer where the episode is younger.
+    The outputs are ``ensemble`` ``[*B, E, S]``, ``mean`` and ``var`` ``[*B, S]``, and ``age`` ``[*B, 1]``: the number
+    of steps since that state, L, or fewer in an episode that is younger.
 
     Args:
-        belief_prefix: prefix of the ``past`` ``[*B, E, L, S]`` that is carried on, and of ``log_weight`` ``[*B, E]``.
+        belief_prefix: prefix of the carried ``past`` ``[*B, E, L, S]``, and of ``log_weight`` ``[*B, E]``.
         weighted: whether the members are particles with log-weights.
-        space: in which the state lives; ``None`` for plain numbers.
+        space: space of the state; ``None`` for plain numbers.
 
     Example:
         >>> from tensordict import TensorDict
@@ -210,12 +210,12 @@ class LaggedBelief(SubModel):
         self.space = space
 
     def compute(self, past, age, log_weight=None):
-        """Returns the past, and the belief of its oldest state."""
+        """Returns the lag window, and the belief of its oldest state."""
         check_age(age, past.shape[:-3])
         ensemble = past[..., -1, :]
         return past, ensemble, *moments_of(ensemble, log_weight, self.space), (age + 1).clamp(max=past.shape[-2])
 
 
 def check_age(age: torch.Tensor, batch_size: Sequence[int]) -> None:
-    """Raises unless the age of the oldest state that is carried is ``[*B, 1]``."""
-    check_shape("the age of what is smoothed", age, (*batch_size, 1), "[*B, 1]")
+    """Raises unless the age of the oldest carried state is ``[*B, 1]``."""
+    check_shape("the age of the smoothed state", age, (*batch_size, 1), "[*B, 1]")

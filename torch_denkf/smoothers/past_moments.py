@@ -1,11 +1,11 @@
 r"""Fixed-lag smoothing of a mean and a covariance: the last L states of a Kalman filter, corrected by each reading.
 
-Of a state :math:`x_{t-j}` three things are carried: its smoothed mean, the product D of the smoother's gains of the
-steps since, and the covariance V that :math:`x_{t-j}` would keep if :math:`x_t` were known. With the belief of t,
-P, the covariance is :math:`V + D P D^T`, and a reading that moves the mean of t by d moves that of t - j by D d. It is
-the Rauch-Tung-Striebel smoother, forward in time, and does not ask how the reading was used.
+For each state :math:`x_{t-j}` the filter carries its smoothed mean, the product D of the smoother's gains of the
+steps since, and the covariance V of :math:`x_{t-j}` given :math:`x_t`. With P, the covariance of the belief of t,
+the smoothed covariance is :math:`V + D P D^T`, and a reading that moves the mean of t by d moves that of t - j by D d.
+This is the Rauch-Tung-Striebel smoother, forward in time; it is independent of the kind of update.
 
-Of points of a space, V and D are of the tangents at the means: each time a mean moves, they are carried to the new one.
+On a space, V and D are of the tangents at the means: each time a mean moves, they are transported to the new one.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class CrossTransition(Wrapper, Transition):
     """A forecast of mean and covariance, with the covariance of the states before and after the step.
 
     Args:
-        transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and its noise
+        transition: :class:`LinearTransition`, :class:`EKFTransition` or :class:`UKFTransition`; its keys and noise
             are kept.
-        with_open: whether it also writes ``"open"``, the covariance of the state before the step where that after it is
-            known, ``[*B, S, S]``; ``"cross"`` has rows before the step, ``[*B, S, S]``, and both stand by the mean.
+        with_open: whether it also writes ``"open"``, the covariance of the state before the step given the state after
+            it, ``[*B, S, S]``; ``"cross"`` has rows before the step, ``[*B, S, S]``. Both have the mean's prefix.
 
     Raises:
         TypeError: for another transition.
@@ -63,12 +63,12 @@ class CrossTransition(Wrapper, Transition):
         return {**written, **dict(zip(self.out_keys[2:], made, strict=True))}
 
     def without_step(self, entries):
-        """Returns the covariances at a reset, zero: there is no state before."""
+        """Returns zero covariances at a reset, where there is no state before."""
         return {key: torch.zeros_like(self.required(entries, self.in_keys[1])) for key in self.out_keys[2:]}
 
 
 def _copies(prefix: str, lag: int, belief: Entries) -> list[torch.Tensor]:
-    """Returns the state itself, of which nothing is left open."""
+    """Returns copies of the state, which V = 0 and D = I determine exactly."""
     mean, cov = belief[prefix, "mean"], belief[prefix, "cov"]
     gain = torch.eye(cov.shape[-1], dtype=mean.dtype, device=mean.device).expand(cov.shape)
     return [torch.stack([value] * lag, -2 if value is mean else -3) for value in (mean, 0 * cov, gain)]
@@ -79,22 +79,22 @@ def _oldest_carried(prefix: str, lag: int, entries: Entries, *, space: Space | N
 
 
 def _oldest(cov: torch.Tensor, past_mean, past_cov, past_gain) -> tuple[torch.Tensor, ...]:
-    """Returns mean, covariance and variance of the oldest state, next to the covariance of the present one."""
+    """Returns mean, covariance and variance of the oldest state, given the covariance of the present one."""
     gain = past_gain[..., -1, :, :]
     smoothed = past_cov[..., -1, :, :] + gain @ cov @ gain.mT
     smoothed = (smoothed + smoothed.mT) / 2
     return past_mean[..., -1, :], smoothed, smoothed.diagonal(dim1=-2, dim2=-1)
 
 
-#: Means ``[*B, L, S]`` of the past, and V and D of above, ``[*B, L, S, S]``, the latest first.
+#: Means ``[*B, L, S]`` of the lag window, and V and D, ``[*B, L, S, S]``, the latest first.
 MOMENTS_PAST = Past(("past_mean", "past_cov", "past_gain"), ("mean", "cov", "var"), _copies, _oldest_carried)
 
 
 class MomentsPast(SubModel):
-    """The past moves on by one step: gains and what they leave open, through the transition that has just been made.
+    """Shifts the lag window by one step: updates gains and residual covariances by the last transition.
 
     Args:
-        belief_prefix: prefix of ``mean`` and of the past, see ``MOMENTS_PAST``.
+        belief_prefix: prefix of ``mean`` and of the lag window, see ``MOMENTS_PAST``.
         forecast_prefix: prefix of ``cov``, ``cross`` and ``open`` of the forecast, see :class:`CrossTransition`.
     """
 
@@ -104,9 +104,9 @@ class MomentsPast(SubModel):
         super().__init__(nn.Identity(), in_keys, [("past", name) for name in ("mean", "cov", "gain")])
 
     def compute(self, mean, cov, cross, open_cov, past_mean, past_cov, past_gain, age):
-        """Returns the past."""
+        """Returns the lag window."""
         check_age(age, mean.shape[:-1])
-        # At the start of an episode, before its own frame, no step has been made.
+        # At the start of an episode, before the update with its own frame, there was no step.
         start = (age < 0).unsqueeze(-1)
         identity = torch.eye(cov.shape[-1], dtype=mean.dtype, device=mean.device)
         gain = torch.where(start, identity, smoothing_gain(cross, torch.where(start, identity, cov)))
@@ -118,12 +118,12 @@ class MomentsPast(SubModel):
 
 
 class LaggedMoments(SubModel):
-    """The past after a reading, and the smoothed belief of the state L steps ago.
+    """Writes the lag window after a reading, and the smoothed belief of the state L steps ago.
 
     Args:
-        belief_prefix: prefix of ``mean``, ``cov`` and of the past that is carried on, see ``MOMENTS_PAST``.
+        belief_prefix: prefix of ``mean``, ``cov`` and of the carried lag window, see ``MOMENTS_PAST``.
         forecast_prefix: prefix of ``mean`` of the forecast.
-        space: in which the state lives; ``None`` for plain numbers.
+        space: space of the state; ``None`` for plain numbers.
     """
 
     def __init__(self, *, belief_prefix: str = "belief", forecast_prefix: str = "forecast", space: Space | None = None):
@@ -135,7 +135,7 @@ class LaggedMoments(SubModel):
         self.space = space
 
     def compute(self, mean, cov, forecast, past_mean, past_cov, past_gain, age):
-        """Returns the past, and the belief of its oldest state."""
+        """Returns the lag window, and the belief of its oldest state."""
         learned = mean - forecast if self.space is None else self.space.minus(mean, forecast)
         shift = (past_gain @ learned[..., None, :, None]).squeeze(-1)
         if self.space is None:

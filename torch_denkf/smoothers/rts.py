@@ -1,4 +1,4 @@
-"""The Rauch-Tung-Striebel smoother of the filters with a mean and a covariance."""
+"""The Rauch-Tung-Striebel smoother for filters with a mean and a covariance."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class RTSSmoother(Smoother):
 
     Args:
         filter: the filter.
-        lag: how many later readings count; ``None`` for all.
+        lag: number of later readings; ``None`` for all.
 
     Raises:
-        TypeError: for a filter without a covariance, or with a transition that gives no cross-covariance.
+        TypeError: for a filter without a covariance, or with a transition that has no cross-covariance.
 
     Reference:
         Särkkä, "Bayesian filtering and smoothing", 2013, sections 8.2, 9.1 and 9.3.

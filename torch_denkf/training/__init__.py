@@ -1,4 +1,4 @@
-"""Training of filters, in stages; then their one number."""
+"""Training of filters in stages, and calibration of a setting."""
 
 from torch_denkf.training.calibration import choose, hold_last
 from torch_denkf.training.distributed import Processes

@@ -12,11 +12,11 @@ _LOG = logging.getLogger("torch_denkf")
 
 
 def back_up(out: Path, files: Sequence[Path]) -> None:
-    """Moves files below a training's folder to ``out/earlier-1``, or the next number that is free, and logs it.
+    """Moves files below a training's folder to ``out/earlier-1``, or the next free number, and logs it.
 
     Args:
         out: the folder.
-        files: below it; their places relative to it stay.
+        files: files below it; their relative paths are kept.
 
     Example:
         >>> import tempfile

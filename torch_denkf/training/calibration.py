@@ -1,4 +1,4 @@
-"""One number of a trained filter, chosen on held-out data; and the baseline that a filter has to beat."""
+"""Calibration of a setting of a trained filter on held-out data; and zero-order hold as a baseline."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ __all__ = ["choose", "hold_last"]
 
 @torch.no_grad()
 def choose(candidates: Sequence[float], apply: Callable[[float], object], error: Callable[[], float]) -> float:
-    """Tries values of a setting, keeps the best one: inflation, tempering, or a factor on the noise.
+    """Chooses the best value of a setting, such as inflation, tempering, or a factor on the noise.
 
     Args:
         candidates: the values to try.
-        apply: sets a value; it is called for each candidate, and at last with the best one.
-        error: what the setting costs on held-out data, lower is better, such as ``abs(coverage - 0.9)`` of
-            :func:`~torch_denkf.metrics.interval_coverage`. Draw its random numbers from the same seed each time, so
-            that candidates differ in nothing else.
+        apply: sets a value; it is called for each candidate, and finally with the best one.
+        error: returns the error on held-out data, lower is better, such as ``abs(coverage - 0.9)`` of
+            :func:`~torch_denkf.metrics.interval_coverage`. Use the same seed each time, so that candidates differ in
+            nothing else.
 
     Returns:
-        the best candidate, which is set; of equally good ones the first. An error of NaN never wins. A warning says
-        where the best one is the last, as a grid that ends too early has it.
+        the best candidate, which is set; the first of equally good ones. An error of NaN never wins. A warning says if
+        the best one is the last, as the grid may end too early.
 
     Raises:
         ValueError: if there are no candidates, or none has a finite error.
@@ -56,14 +56,14 @@ def hold_last(
     start: torch.Tensor,
     accept: Callable[[int, torch.Tensor], torch.Tensor] | None = None,
 ) -> torch.Tensor:
-    """Holds the last reading where there is none: what a filter has to beat.
+    """Repeats the last reading (zero-order hold), a baseline for a filter.
 
     Args:
         values: readings ``[*B, T, D]``.
-        observed: which of them are there, ``[*B, T, 1]`` or ``[*B, T, D]``, bool.
-        start: held before the first reading, ``[*B, D]``.
-        accept: ``accept(t, held)`` says which readings at step t are usable, ``[*B, 1]`` or ``[*B, D]``, bool, given
-            what is held ``[*B, D]``; all by default.
+        observed: observed mask, ``[*B, T, 1]`` or ``[*B, T, D]``, bool.
+        start: value before the first reading, ``[*B, D]``.
+        accept: ``accept(t, held)`` returns the mask of usable readings at step t, ``[*B, 1]`` or ``[*B, D]``, bool,
+            given the held values ``[*B, D]``; all by default.
 
     Returns:
         the readings, with held ones in the gaps, ``[*B, T, D]``.

@@ -1,4 +1,4 @@
-"""Checkpoint files: written whole or not at all, checked before they are used.
+"""Checkpoint files: atomic writes, and checks before use.
 
 torchrl's own ``Checkpoint`` has neither checksums nor a sync with the disk, and may read pickles.
 """
@@ -23,16 +23,16 @@ _FORMAT = "torch_denkf.training/1"
 
 
 def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
-    """Writes ``content`` next to ``file`` and then puts it in its place: a kill leaves the old file or the new one.
+    """Writes ``content`` atomically to ``file``: after a kill there is either the old file or the new one.
 
     Equal content gives equal bytes.
 
     Args:
-        file: path; its folder is made.
-        content: tensors, state dicts and plain values, nested as you like.
+        file: path; its folder is created.
+        content: nested tensors, state dicts and plain values.
 
     Raises:
-        OSError: if it cannot be written, as on a full disk; names the file and the free space.
+        OSError: if it cannot be written, as on a full disk; the message names the file and the free space.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -41,7 +41,7 @@ def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
         >>> read_checkpoint(file)["model"]
         {'weight': tensor([1.])}
     """
-    memory = io.BytesIO()  # torch.save to a disk that is full fails with another error, or ends the process
+    memory = io.BytesIO()  # torch.save to a full disk fails with another error, or ends the process
     torch.save(_alone({"format": _FORMAT, **content}), memory)
     write_bytes(file, memory.getbuffer())
 
@@ -49,8 +49,8 @@ def write_checkpoint(file: Path | str, content: Mapping[str, Any]) -> None:
 def _alone(content: Any) -> Any:
     """Copies the content to new containers, with one object for each text.
 
-    Pickle writes an object that it has met before as a reference to the first. So the same words and numbers give other
-    bytes where two equal texts are two objects, as they are once one of them has been read from a file.
+    Pickle writes a repeated object as a reference. So equal content gives other bytes if two equal texts are different
+    objects, as after reading one of them from a file.
     """
     if isinstance(content, dict):
         return {_alone(key): _alone(value) for key, value in content.items()}
@@ -74,12 +74,12 @@ def read_checkpoint(file: Path | str) -> dict[str, Any]:
         raise FileNotFoundError(f"There is no checkpoint {file}.")
     cure = "move it away to start again, or restore it from a copy"
     try:
-        with zipfile.ZipFile(file) as archive:  # torch.load does not look at the checksums
+        with zipfile.ZipFile(file) as archive:  # torch.load ignores the checksums
             if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
                 raise ValueError("its parts are compressed, and could be of any size; torch stores them as they are")
             damaged = archive.testzip()
         content = torch.load(file, map_location="cpu", weights_only=True) if damaged is None else None
-    except Exception as error:  # zipfile, torch and pickle have a dozen kinds for a file cut short
+    except Exception as error:  # zipfile, torch and pickle raise a dozen kinds for truncated files
         raise ValueError(f"{file} cannot be read as a checkpoint ({error}); {cure}.") from error
     if damaged is not None:
         raise ValueError(f"{file} is damaged: the checksum of its part {damaged!r} is wrong; {cure}.")
@@ -88,7 +88,7 @@ def read_checkpoint(file: Path | str) -> dict[str, Any]:
     return content
 
 
-#: What a checkpoint of a training holds.
+#: Entries of a training's checkpoint.
 _STATE = {
     "settings": dict,
     "stage": int,
@@ -106,7 +106,7 @@ _BEST = {"stage": str, "update": int, "model": dict, "metrics": dict}
 
 
 def check_state(file: Path | str, state: Mapping[str, Any]) -> None:
-    """Raises unless a checkpoint holds the state of a training, with parameters that are no NaN.
+    """Raises unless a checkpoint has the state of a training, without NaN in the parameters.
 
     Args:
         file: the checkpoint, for the message.
@@ -137,20 +137,20 @@ def check_state(file: Path | str, state: Mapping[str, Any]) -> None:
         if not re.fullmatch(r"[\w-]+", state["best"]["stage"]):
             refuse(f"its best is of stage {state['best']['stage']!r}")
     for name, value in state["model"].items():
-        # An infinite buffer may be meant, such as a mask of -inf.
+        # Infinite buffers are allowed, such as a mask of -inf.
         if isinstance(value, torch.Tensor) and value.is_floating_point() and bool(value.isnan().any()):
             refuse(f"{name!r} of its model has NaN")
 
 
 def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[str, Any], stage: int) -> None:
-    """Raises unless a checkpoint is of the training that is to be resumed.
+    """Raises unless a checkpoint belongs to the training to resume.
 
-    Stages that had not begun may have been changed, added or left out since.
+    Stages that had not begun may be changed, added or left out.
 
     Args:
         file: the checkpoint, for the message.
         saved: the settings in the checkpoint: ``seed``, ``processes`` and ``stages``, a list of dicts.
-        wanted: those of the training.
+        wanted: settings of the training.
         stage: number of the stage in which the checkpoint was written.
 
     Raises:
@@ -176,7 +176,7 @@ def check_settings(file: Path | str, saved: Mapping[str, Any], wanted: Mapping[s
 
 
 def _short(value: Any, other: Any) -> str:
-    """Returns a setting, for a message; of the names of parameters those that the other one has not."""
+    """Returns a setting for a message; of lists of parameter names, only the names that the other lacks."""
     if not isinstance(value, list) or not isinstance(other, list):
         return str(value)
     own = [name for group in value for name in group if not any(name in theirs for theirs in other)]

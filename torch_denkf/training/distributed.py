@@ -1,4 +1,4 @@
-"""The processes of a data-parallel training, as ``torchrun`` starts them."""
+"""Processes of a data-parallel training under ``torchrun``."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ T = TypeVar("T")
 
 
 class Processes:
-    """This process among those of the run; without ``torchrun`` the only one.
+    """Rank, world size and device of this process; without ``torchrun`` it is the only one.
 
     Gradients are averaged by hand, not by ``DistributedDataParallel``: that wraps one module's ``forward`` and finds
-    the tensors in its output, while a loss here is any callable whose output is a tensordict. One sum of one flat
-    vector an update also carries the loss terms, so that all processes agree on whether a step is finite.
+    the tensors in its output, while a loss here is any callable whose output is a tensordict. The one flat vector that
+    is summed per update includes the loss terms, so that all processes agree on whether a step is finite.
 
     Args:
-        device: of this process; by default its GPU if there is one, else the CPU.
+        device: device of this process; by default its GPU if there is one, else the CPU.
 
     Attributes:
         rank: number of this process, from 0.
@@ -69,7 +69,7 @@ class Processes:
         return box[0]
 
     def any(self, here: bool) -> bool:
-        """Tells whether something is so in any of the processes; the same answer in all."""
+        """Returns True in all processes if ``here`` is True in any."""
         if self.world_size == 1:
             return here
         count = torch.tensor(int(here), device=self.device)
@@ -79,10 +79,10 @@ class Processes:
     def average_(self, parameters: Iterable[nn.Parameter], values: torch.Tensor) -> torch.Tensor:
         """Averages the gradients in place over the processes.
 
-        A parameter without a gradient counts as zero where another process has one, and is left without if none has.
+        A missing gradient counts as zero if another process has one; else it stays missing.
 
         Args:
-            parameters: the trained ones, in the same order everywhere.
+            parameters: the trained parameters, in the same order in all processes.
             values: ``[K]``, averaged over the processes, too.
 
         Returns:
@@ -98,7 +98,7 @@ class Processes:
         sizes = [len(values), len(has_gradient), *(p.numel() for p in parameters)]
         values, has_gradient, *gradients = flat.split(sizes)
         for parameter, flag, gradient in zip(parameters, has_gradient.tolist(), gradients, strict=True):
-            # In one process a parameter that the loss does not touch is not decayed either.
+            # A parameter without a gradient has no weight decay, as in a single process.
             parameter.grad = (gradient / self.world_size).view_as(parameter).to(parameter.dtype) if flag else None
         return values / self.world_size
 

@@ -1,4 +1,4 @@
-"""The places in the training loop where torchrl's trainer hooks can be put."""
+"""Hook points of the training loop for torchrl's trainer hooks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _POINTS = {
 
 
 class HookPoints:
-    """Takes hooks as torchrl's ``Trainer`` does: ``hook.register(trainer)`` or ``trainer.register_op(place, hook)``.
+    """Registers hooks like torchrl's ``Trainer``: ``hook.register(trainer)`` or ``trainer.register_op(place, hook)``.
 
-    The places are those of torchrl that this loop has: ``"pre_optim_steps"``, ``"process_optim_batch"``,
-    ``"post_optim"``, and, at updates that are logged only, ``"pre_steps_log"`` and ``"post_optim_log"``. So
-    ``ClearCudaCache``, ``BatchSubSampler``, ``LogScalar`` and ``LogTiming`` work as they are.
+    It has these of torchrl's places: ``"pre_optim_steps"``, ``"process_optim_batch"``, ``"post_optim"``, and, at
+    updates that are logged only, ``"pre_steps_log"`` and ``"post_optim_log"``. So ``ClearCudaCache``,
+    ``BatchSubSampler``, ``LogScalar`` and ``LogTiming`` work as they are.
 
     Example:
         >>> points = HookPoints()
@@ -37,7 +37,7 @@ class HookPoints:
         self._hook_modules: dict[str, Any] = {}
 
     def register_op(self, dest: str, op: Callable, **kwargs) -> None:
-        """Calls ``op(..., **kwargs)`` at a place of the loop.
+        """Registers ``op(..., **kwargs)`` at a place of the loop.
 
         Raises:
             ValueError: if the loop has no such place.
@@ -48,7 +48,7 @@ class HookPoints:
         self._ops[dest].append((op, kwargs))
 
     def register_module(self, module_name: str, module: Any) -> None:
-        """Keeps ``module``'s ``state_dict`` in the checkpoints.
+        """Includes ``module``'s ``state_dict`` in the checkpoints.
 
         Raises:
             ValueError: if the name is taken.
@@ -71,7 +71,7 @@ class HookPoints:
         values: dict[str, float] = {}
         for op, kwargs in self._ops[place]:
             values.update(op(batch, **kwargs) or {})
-        values.pop("log_pbar", None)  # torchrl's wish to be in the bar, not a value
+        values.pop("log_pbar", None)  # torchrl's flag for the progress bar, not a value
         return values
 
     def _hook_state(self) -> dict[str, Any]:

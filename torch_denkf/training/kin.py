@@ -1,4 +1,4 @@
-"""Weights of one filter for another of the same parts."""
+"""Transfer of weights between filters with the same sub-models."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ __all__ = ["take_weights"]
 
 
 def take_weights(filter: Filter, source: Filter) -> list[str]:
-    """Copies what was learned into a filter of the same parts: of another kind, delay or number of members.
+    """Copies trained weights into a filter with the same sub-models, but another kind, delay or number of members.
 
-    A sub-model takes the weights of the one of its class, names and shapes; of several, of the one in its place, or of
-    the one that comes as the first, second, ... of them. What has no parameters, such as a prior, stays as it is.
+    A sub-model takes the weights of the one with the same class, names and shapes; among several, of the one in the
+    same place, or with the same position in their order. Sub-models without parameters, such as a prior, do not change.
 
     Args:
         filter: changed in place.
-        source: the trained one.
+        source: the trained filter.
 
     Returns:
-        the names of the parameters in ``filter`` that took nothing.
+        the names of the parameters in ``filter`` that were not replaced.
 
     Raises:
-        ValueError: if no sub-model fits, or if it is not clear which of several a sub-model is to take.
+        ValueError: if no sub-model matches, or the match of a sub-model is ambiguous.
 
     Example:
         >>> from torch_denkf import DEnKF, EKF
@@ -72,7 +72,7 @@ def take_weights(filter: Filter, source: Filter) -> list[str]:
 
 
 def _learned(filter: Filter) -> list[tuple[str, tuple, dict[str, Tensor]]]:
-    """Place, kind and tensors of each sub-model with parameters, without those of sub-models inside it."""
+    """Returns place, kind and tensors of each sub-model with parameters, without those of nested sub-models."""
     found = []
     for path, module in filter.named_modules():
         if not isinstance(module, SubModel):

@@ -1,4 +1,4 @@
-"""A run's logs, which a resumed run continues as if it had never been broken off."""
+"""Logs of a training, which a resumed training continues without duplicates."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ _KINDS = {
 
 
 class RunLogs:
-    """torchrl's loggers, of which those made here can be set back to an earlier :meth:`mark`.
+    """Wraps torchrl's loggers; the file loggers created here can be reset to an earlier :meth:`mark`.
 
-    Both of torchrl's file loggers only ever append, so the sizes of their files are all that a checkpoint needs: on
-    resuming, files are cut to their size and those that did not exist are removed.
+    torchrl's file loggers only append, so that a checkpoint needs only the sizes of their files: on resuming, files are
+    truncated to their size and later files are removed.
 
     Args:
-        folder: holds ``csv/scalars/*.csv`` (rows ``step,value``) and ``tensorboard/events.out.tfevents.*``.
-        loggers: ``"csv"``, ``"tensorboard"``, or loggers of torchrl, which are written to as they are: what they got
-            after the last checkpoint stays, and comes again.
+        folder: folder of ``csv/scalars/*.csv`` (rows ``step,value``) and ``tensorboard/events.out.tfevents.*``.
+        loggers: ``"csv"``, ``"tensorboard"``, or loggers of torchrl, which are not reset: values after the last
+            checkpoint are logged twice.
 
     Raises:
-        ValueError: on an unknown name.
-        ImportError: if ``tensorboard`` is asked for and not installed.
+        ValueError: for an unknown name.
+        ImportError: if ``tensorboard`` is requested and not installed.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -55,7 +55,7 @@ class RunLogs:
             )
 
     def open(self, mark: Mapping[str, int]) -> None:
-        """Sets the files back to ``mark`` (``{}``: to nothing) and opens the loggers."""
+        """Truncates the files to ``mark`` (``{}`` removes them) and opens the loggers."""
         for file, name in self._files():
             if name not in mark:
                 file.unlink()
@@ -69,13 +69,13 @@ class RunLogs:
         """Writes scalars.
 
         Raises:
-            OSError: if they cannot be written, as on a full disk; names the folder and the free space.
+            OSError: if they cannot be written, as on a full disk; the message names the folder and the free space.
         """
         with clear_errors(self.folder / "csv", "choose another out", name=f"logs to {self.folder}"):
             self._log(values, step)
 
     def files(self) -> list[Path]:
-        """Returns the files that the loggers made here write."""
+        """Returns the files of the loggers created here."""
         return [file for file, _ in self._files()]
 
     def _log(self, values: Mapping[str, float], step: int) -> None:
@@ -83,21 +83,21 @@ class RunLogs:
             logger.log_metrics(dict(values), step=step)
 
     def mark(self) -> dict[str, int]:
-        """Returns the sizes of all files in bytes, as they are now."""
+        """Returns the present sizes of all files in bytes."""
         with clear_errors(self.folder / "csv", "choose another out", name=f"logs to {self.folder}"):
             for logger in self._own:
                 logger.flush()
         return {name: file.stat().st_size for file, name in self._files()}
 
     def close(self) -> None:
-        """Closes the loggers made here."""
+        """Closes the loggers created here."""
         own, self._own = self._own, []
         with clear_errors(self.folder / "csv", "choose another out", name=f"logs to {self.folder}"):
             for logger in own:
                 logger.close()
 
     def _files(self) -> list[tuple[Path, str]]:
-        # Only what these loggers write: the folder may hold files of other people.
+        # Only files of these loggers: the folder may have other files.
         patterns = [pattern for _, pattern in _KINDS.values()]
         files = sorted(file for pattern in patterns for file in self.folder.glob(pattern))
         return [(file, file.relative_to(self.folder).as_posix()) for file in files]

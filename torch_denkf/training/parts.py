@@ -1,4 +1,4 @@
-"""A sensor, then a filter, then both: training of one part."""
+"""Training of one part of a filter, such as its sensor."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def train_part(part: M, stage: Stage, *, out: Path | str, **settings: Any) -> M:
-    """Trains one part of a filter by itself, or reads it where that was done before.
+    """Trains one part of a filter separately, or loads it if it is trained already.
 
-    A study trains its sensor like this before it trains filters on what the sensor reads.
+    A study trains its sensor like this before it trains filters on the sensor's readings.
 
     Args:
         part: e.g. a sensor or a motion model; trained in place.
-        stage: what is fitted; its name names the file ``out/<name>.pt`` with the finished part.
-        out: folder; a training that was broken off goes on from there.
-        **settings: of :class:`FilterTrainer`.
+        stage: the stage; the trained part is written to ``out/<name>.pt``.
+        out: folder, from which an interrupted training resumes.
+        **settings: settings of :class:`FilterTrainer`.
 
     Returns:
         the part.
@@ -34,7 +34,7 @@ def train_part(part: M, stage: Stage, *, out: Path | str, **settings: Any) -> M:
         >>> from tempfile import mkdtemp
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> net, out = nn.Linear(1, 1), mkdtemp()  # to become 2 x
+        >>> net, out = nn.Linear(1, 1), mkdtemp()  # learns 2 x
         >>> loss = lambda batch: {"loss": (net(batch["x"]) - 2 * batch["x"]).square().mean()}
         >>> sample = lambda generator, length: TensorDict({"x": torch.rand(8, 1, generator=generator)}, [8])
         >>> trained = train_part(net, Stage("line", loss, sample, updates=200, lr=0.1), out=out, device="cpu")

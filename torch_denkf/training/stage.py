@@ -1,4 +1,4 @@
-"""One stage of a training: what is fitted, on which batches, for how long and at which rate."""
+"""Stage of a training: loss, batches, parameters, number of updates and learning rate."""
 
 from __future__ import annotations
 
@@ -22,34 +22,33 @@ _SCHEDULES = ("one_cycle", "cosine", "constant")
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A part of a training: AdamW on some parameters of a model, all others frozen.
+    """Stage of a training: AdamW on some parameters of a model, all others frozen.
 
     Args:
         name: letters, digits, ``_`` and ``-``; it names files and log entries.
         loss: maps a batch to a mapping (a tensordict, a dict) of scalars. Those whose name starts with ``"loss"`` are
             summed and minimised; the others are logged only. Any torchrl loss module will do.
-        sample: ``sample(generator, length)`` draws a training batch. All its randomness is to come from the generator
-            (on the CPU), so that a resumed training sees the same batches. ``length`` is that of ``lengths``, or
-            ``None``.
+        sample: ``sample(generator, length)`` draws a training batch. All its randomness must come from the generator
+            (on the CPU), so that a resumed training has the same batches. ``length`` is from ``lengths``, or ``None``.
         updates: number of optimiser steps.
-        parameters: what is trained: parameters, or groups as torch's optimisers take them,
-            ``[{"params": ..., "lr": ...}, ...]``. By default all parameters of ``loss`` (if that is a module, else of
-            the trainer's model) that require gradients.
-        frozen: names of modules of the model, a filter's places, that stay as they are, such as ``["camera_sensor"]``.
-            A sensor that learned few demonstrations by heart reads them too well, so that noise learned on them is too
-            small: freeze it, and learn the noise on episodes that it has not seen.
+        parameters: parameters to train, or groups of torch's optimisers, ``[{"params": ..., "lr": ...}, ...]``. By
+            default all parameters of ``loss`` (if that is a module, else of the trainer's model) that require
+            gradients.
+        frozen: names of modules of the model (places of a filter) to freeze, such as ``["camera_sensor"]``. On its
+            training data a sensor that overfits is too accurate, so that noise learned there is too small: freeze the
+            sensor, and learn the noise on other episodes.
         lr: learning rate; the peak for ``"one_cycle"``, the start for ``"cosine"``.
-        weight_decay: of AdamW, per unit of learning rate.
+        weight_decay: weight decay of AdamW, per unit of learning rate.
         schedule: ``"one_cycle"``, ``"cosine"`` (to zero), ``"constant"``, or ``schedule(optimiser, updates)``, which
             returns one of torch's schedulers; it is stepped after each update.
         clip: largest norm of the gradient; ``None`` for no limit.
         lengths: sequence lengths, ``{from_update: length}``, e.g. ``{0: 4, 500: 16}``: short ones first.
-        validate: in the place of the trainer's, e.g. where a sensor is trained alone.
-        monitor: in the place of the trainer's.
+        validate: replaces the trainer's, e.g. for training a sensor alone.
+        monitor: replaces the trainer's.
 
     Raises:
-        ValueError: on a bad name, no updates, an unknown schedule, or lengths that say nothing about update 0.
-        TypeError: if ``frozen`` is one name and no list of them.
+        ValueError: for an invalid name, no updates, an unknown schedule, or lengths without update 0.
+        TypeError: if ``frozen`` is a name instead of a list.
 
     Example:
         >>> from tensordict import TensorDict
@@ -94,7 +93,7 @@ class Stage:
         if isinstance(self.frozen, str):
             raise TypeError(f"Stage {self.name!r}: frozen is a list of names, [{self.frozen!r}].")
         object.__setattr__(self, "frozen", tuple(self.frozen))
-        if self.parameters is not None:  # often generators, which would be empty the second time
+        if self.parameters is not None:  # generators could be used only once
             parameters = [
                 {**entry, "params": list(entry["params"])} if isinstance(entry, dict) else entry
                 for entry in self.parameters
@@ -111,7 +110,7 @@ class Stage:
         """Returns the trained parameters as an optimiser's groups.
 
         Raises:
-            ValueError: if there are none, or ``model`` lacks some: no checkpoint would hold them.
+            ValueError: if there are none, or ``model`` lacks some, which checkpoints would miss.
         """
         given: list[Any]
         if self.parameters is None:
@@ -149,7 +148,7 @@ class Stage:
         return optimiser, LambdaLR(optimiser, lambda update: 1.0)
 
     def settings(self, model: nn.Module) -> dict:
-        """Returns the settings that a checkpoint must share to be resumed; plain values."""
+        """Returns the settings that must equal those of a checkpoint to resume; plain values."""
         names = {id(parameter): name for name, parameter in model.named_parameters()}
         schedule = self.schedule if isinstance(self.schedule, str) else getattr(self.schedule, "__qualname__", "custom")
         return {
@@ -165,13 +164,13 @@ class Stage:
 
 
 def why_no_gain(stage: Stage, first: float, value: float, update: int) -> str:
-    """Returns what a stage that gained less than 1 % is to be told, or nothing.
+    """Returns advice for a stage that lowered the error by less than 1 %, else an empty text.
 
     Args:
         stage: the stage.
         first: the monitored error before its first update.
-        value: the one that was kept.
-        update: after which it was found.
+        value: the best error.
+        update: number of updates at the best error.
 
     Example:
         >>> why_no_gain(Stage("whole", dict, dict, 100, lengths={0: 6}), 2.0, 2.0, 0)[:67]
@@ -192,7 +191,7 @@ def why_no_gain(stage: Stage, first: float, value: float, update: int) -> str:
 
 @contextmanager
 def only_trainable(model: nn.Module, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
-    """Freezes all of ``model`` but ``parameters``; afterwards every parameter is as it was."""
+    """Freezes all of ``model`` except ``parameters``, and restores ``requires_grad`` afterwards."""
     before = [(parameter, parameter.requires_grad) for parameter in model.parameters()]
     trained = {id(parameter) for parameter in parameters}
     try:
@@ -206,11 +205,11 @@ def only_trainable(model: nn.Module, parameters: Iterable[nn.Parameter]) -> Iter
 
 
 def parameters_without(model: nn.Module, names: Iterable[str]) -> list[nn.Parameter]:
-    """Returns the parameters of a filter without those of some of its modules, which stay as they are.
+    """Returns the parameters of a filter without those of some of its modules.
 
     Args:
-        model: a filter, or another one with named modules.
-        names: of the modules to leave out, as in ``model[name]``.
+        model: a filter, or another model with named modules.
+        names: names of the modules to leave out, as in ``model[name]``.
 
     Returns:
         the parameters, in the model's order.

@@ -1,4 +1,4 @@
-"""Trains any filter, or a part of one, in stages; a training that was killed goes on as if it had not been."""
+"""Trains a filter, or a part of one, in stages; an interrupted training resumes exactly."""
 
 from __future__ import annotations
 
@@ -27,59 +27,60 @@ from torch_denkf.training.update import Updates, seed_update
 __all__ = ["FilterTrainer"]
 
 _LOG = logging.getLogger("torch_denkf")
-_VALIDATION = 2**32 - 1  # the "stage" whose seed every validation starts from
+_VALIDATION = 2**32 - 1  # stage number for the seed of validations
 
 
 class FilterTrainer(HookPoints):
     """Runs :class:`Stage` after :class:`Stage` on one model, validates, and keeps the best.
 
-    torchrl's ``Trainer`` steps through a collector, has one loss and one optimiser, and does not restore all that an
-    exact resumption needs. This loop is our own, therefore; torchrl's losses, loggers and hooks
-    (:class:`~torch_denkf.training.hooks.HookPoints`) go in as they are.
+    torchrl's ``Trainer`` steps through a collector, has one loss and one optimiser, and does not resume exactly. This
+    is a separate loop, therefore, which works with torchrl's losses, loggers and hooks
+    (:class:`~torch_denkf.training.hooks.HookPoints`).
 
     A stage is validated before its first update, every ``validate_every`` updates and after its last. The next stage
-    starts from the best parameters of the one before, and those of the last are in the model at the end. A stage that
-    lowered the monitored error by less than 1 % is logged as a warning, with what is likely.
+    starts from the best parameters of the one before, and the model ends with the best of the last stage. A stage that
+    lowered the monitored error by less than 1 % logs a warning with likely causes.
 
-    **Resuming.** ``fit`` goes on from ``out/last.pt`` where there is one. After a kill at any point, parameters and
-    CSV logs are bit for bit those of an unbroken run, on the same machine and number of threads; so are the checkpoint
-    files, where no tensorboard's files, which are named after the time, are among the logs. On a GPU, as far as
-    its kernels are deterministic (``torch.use_deterministic_algorithms``). The model's modules must not keep a state
-    outside of their ``state_dict``, and a sampler none at all. A training that was finished is read, not repeated; the
-    logger ``"torch_denkf"`` says so. Where ``last.pt`` is missing, what else an
-    earlier run left is not overwritten: it is moved to ``out/earlier-1``. One process at a time trains in ``out``.
+    **Resuming.** ``fit`` continues from ``out/last.pt`` if it exists. After a kill at any point, parameters and CSV
+    logs equal those of an uninterrupted run exactly, on the same machine and number of threads; so do the checkpoint
+    files, unless tensorboard's files, which are named after the time, are among the logs. On a GPU this needs
+    deterministic kernels (``torch.use_deterministic_algorithms``). The model's modules must not have a state outside of
+    their ``state_dict``, and a sampler none at all. A finished training is loaded, not repeated, with a message of the
+    logger ``"torch_denkf"``. Without ``last.pt``, other files of an earlier run are moved to ``out/earlier-1``. One
+    process at a time trains in ``out``.
 
-    **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each samples its own part (``sample`` with
-    another generator) and the gradients are averaged, as of one batch of twice the size where the loss is a mean over
-    equally many elements in each. The first process validates, logs and writes; all return the same.
+    **Several processes.** ``torchrun --nproc_per_node=2 script.py``: each process samples with another generator, and
+    the gradients are averaged, which equals one batch of twice the size if the loss is a mean over equally many
+    elements in each. The first process validates, logs and writes; all return the same.
 
     Args:
-        model: what is trained and checkpointed; holds the parameters of all stages.
+        model: module to train, with the parameters of all stages.
         stages: the stages, in order.
-        out: folder; gets ``last.pt``, ``best_<stage>.pt`` (read them with :func:`read_checkpoint`; ``["model"]`` is
-            the model's state dict) and ``logs/``.
+        out: folder of ``last.pt``, ``best_<stage>.pt`` (read them with :func:`read_checkpoint`; ``["model"]`` is the
+            model's state dict) and ``logs/``.
         validate: returns errors on held-out data, ``{name: value}``. It is called without gradients, with the model in
-            ``eval()`` mode, and from the same seed each time.
-        monitor: the error that decides, lower is better; may be left out where ``validate`` returns but one.
-        validate_every: updates.
-        save_every: updates; at most so many are lost by a kill.
-        log_every: updates; their means are logged as ``<stage>/<term>``, validations as
-            ``<stage>/validation/<name>``, with the number of updates made in the stage as step.
+            ``eval()`` mode, and with the same seed each time.
+        monitor: name of the error to minimise; may be left out if ``validate`` returns only one.
+        validate_every: updates between validations.
+        save_every: updates between checkpoints.
+        log_every: updates between logs of their means, ``<stage>/<term>``; validations are logged as
+            ``<stage>/validation/<name>``, with the number of updates in the stage as step.
         loggers: see :class:`RunLogs`.
-        seed: of all random numbers of the training, at least 0. The model's initial parameters are yours to seed.
+        seed: seed of all random numbers of the training, at least 0. The caller seeds the model's initial parameters.
         device: by default the GPU if there is one.
         keep: ``"best"``, or ``"last"``: stages begin and end with the parameters of the last update.
-        max_skipped: so many updates in a row are left out because the loss or its gradient is not finite; one more is
-            an error. The first one of a stage is logged, with the entries of its batch that are not finite.
-        progress: whether a bar, or off a terminal a line every ten seconds, shows how far it is.
+        max_skipped: largest number of successive updates that are skipped because the loss or its gradient is not
+            finite; more are an error. The first one of a stage is logged, with the entries of its batch that are not
+            finite.
+        progress: whether to show a progress bar, or without a terminal a line every ten seconds.
 
     Raises:
-        ValueError: on stages without parameters, with the same names, or whose parameters the model does not hold.
+        ValueError: for stages without parameters, with equal names, or with parameters outside of the model.
 
     Example:
         >>> from tempfile import mkdtemp
         >>> from tensordict import TensorDict
-        >>> net = nn.Linear(1, 1)  # to become 3 x + 1
+        >>> net = nn.Linear(1, 1)  # learns 3 x + 1
         >>> line = lambda x: TensorDict({"x": x, "y": 3 * x + 1}, x.shape[:1])
         >>> error = lambda batch: (net(batch["x"]) - batch["y"]).square().mean()
         >>> fit = Stage(
@@ -131,7 +132,7 @@ class FilterTrainer(HookPoints):
         self.validate_every, self.save_every, self.log_every = validate_every, save_every, log_every
         self.seed, self.keep, self.max_skipped, self.progress = seed, keep, max_skipped, progress
         self.processes = Processes(device)
-        for module in (model, *(stage.loss for stage in stages)):  # a loss has buffers of its own
+        for module in (model, *(stage.loss for stage in stages)):  # losses may have buffers
             if isinstance(module, nn.Module):
                 module.to(self.processes.device)
         self._settings = {
@@ -151,20 +152,20 @@ class FilterTrainer(HookPoints):
         return self.out / "last.pt"
 
     def fit(self, *, resume: bool = True) -> dict[str, dict[str, Any]]:
-        """Trains to the end; where a checkpoint is, from there.
+        """Trains to the end, from a checkpoint if there is one.
 
         Args:
             resume: ``False`` removes an earlier run's checkpoints and logs from ``out`` and restarts.
 
         Returns:
             for each stage: ``value`` of the monitored error (``None`` without validation) at its best ``update``, all
-            ``metrics`` there, the ``path`` of that checkpoint, and how many updates were ``skipped``.
+            ``metrics`` there, the ``path`` of that checkpoint, and the number of ``skipped`` updates.
 
         Raises:
             ValueError: if the checkpoint is damaged, or of another training; the message names the file.
-            OSError: if another process trains in ``out``, or if it cannot be written to; names the folder and the
-                process, or the file and the free space.
-            FloatingPointError: if too many updates in a row are not finite; names stage and update.
+            OSError: if another process trains in ``out``, or it cannot be written to; the message names the folder and
+                the process, or the file and the free space.
+            FloatingPointError: if too many updates in a row are not finite; the message names stage and update.
         """
         alone = locked(self.out, ".training", "is training in it") if self.processes.is_main else nullcontext()
         with alone:
@@ -176,7 +177,7 @@ class FilterTrainer(HookPoints):
         self._results, self._best = state["results"], state["best"]
         self._last_metrics, self._first = state["last_metrics"], state["first"]
         self._load_hook_state(state["hooks"])
-        randomness = GlobalRNGState().state_dict()  # what follows a training is not to depend on where it was resumed
+        randomness = GlobalRNGState().state_dict()  # later random numbers must not depend on a resumption
         try:
             for number in range(state["stage"], len(self.stages)):
                 self._run_stage(number, state["updates"], state["update"])
@@ -247,7 +248,7 @@ class FilterTrainer(HookPoints):
             return
         training = [module for module in self.model.modules() if module.training]
         self.model.eval()
-        seed_update(self.seed, _VALIDATION, 0)  # the next update sets a seed of its own
+        seed_update(self.seed, _VALIDATION, 0)  # the next update sets its own seed
         try:
             with torch.no_grad():
                 metrics = {name: float(value) for name, value in validate().items()}
@@ -308,7 +309,7 @@ class FilterTrainer(HookPoints):
             state = read_checkpoint(self.last_checkpoint)
             check_state(self.last_checkpoint, state)
             check_settings(self.last_checkpoint, state["settings"], self._settings, state["stage"])
-            if state["best"] is not None:  # the file may be from validations that are about to be repeated
+            if state["best"] is not None:  # the file may be from later validations, which will be repeated
                 write_checkpoint(self.out / f"best_{state['best']['stage']}.pt", state["best"])
             self._logs.open(state["logs"])
             if state["stage"] == len(self.stages):

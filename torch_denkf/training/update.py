@@ -1,4 +1,4 @@
-"""One update: loss, gradient, clipping, step; and what is to be known of the last few."""
+"""One update: loss, gradient, clipping, step; and means over the last updates for logs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["Updates", "seed_update"]
 def seed_update(seed: int, stage: int, update: int, rank: int = 0) -> torch.Generator:
     """Seeds Python, NumPy and torch (all devices) for one update, and returns a generator for its batch.
 
-    An update's random numbers are a function of its number and its process. So a checkpoint need not hold the state
-    of any generator, of any process, and nothing that draws random numbers in between can change a training.
+    An update's random numbers are a function of its number and its process. So a checkpoint needs no state of any
+    generator, and random draws in between do not change a training.
 
     Args:
-        seed: of the run, at least 0.
+        seed: seed of the run, at least 0.
         stage: number of the stage.
         update: number of the update, from 0.
         rank: number of the process.
@@ -44,17 +44,17 @@ def seed_update(seed: int, stage: int, update: int, rank: int = 0) -> torch.Gene
 
 
 class Updates:
-    """The optimiser of a stage, and sums over the updates since the last call of :meth:`summary`.
+    """Optimiser of a stage, with sums over the updates since the last call of :meth:`summary`.
 
     Args:
         stage: the stage.
         groups: the trained parameters, from :meth:`Stage.groups`.
-        processes: with which the gradient is averaged.
+        processes: processes over which the gradient is averaged.
 
     Attributes:
-        skipped: updates of the stage that were left out because the loss or its gradient was not finite.
-        in_a_row: those of them that were the last ones.
-        cause: names the entries that were not finite in the batch of the last of them; empty where all were finite.
+        skipped: number of skipped updates of the stage, whose loss or gradient was not finite.
+        in_a_row: number of successive skipped updates up to the last one.
+        cause: names of the non-finite entries in the last skipped batch; empty if all were finite.
 
     Example:
         >>> net = torch.nn.Linear(1, 1, bias=False)
@@ -76,8 +76,8 @@ class Updates:
     def step(self, batch: TensorDictBase) -> bool:
         """Makes one optimiser step, unless the loss or its gradient is not finite.
 
-        A step left out leaves parameters, optimiser and schedule as they are. Whether a step is finite is the only
-        number that is read back from the device.
+        A skipped step does not change parameters, optimiser and schedule. The check for finite values is the only
+        synchronisation with the device.
 
         Returns:
             whether the step was made; the same in all processes.
@@ -107,7 +107,7 @@ class Updates:
         return True
 
     def _skip(self, batch: TensorDictBase) -> bool:
-        """Leaves the step out, and says which entries of the batch are not finite."""
+        """Skips the step, and names the entries of the batch that are not finite."""
         self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
         values = batch.items(True, True) if isinstance(batch, TensorDictBase) else batch.items()
         keys = [key for key, value in values if value.is_floating_point() and not bool(value.isfinite().all())]
@@ -127,7 +127,7 @@ class Updates:
         return {**values, "skipped": float(self.skipped)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that the next update depends on, besides the model."""
+        """Returns the state of the optimiser, the schedule and the sums, without the model."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "schedule": self.schedule.state_dict(),
@@ -139,7 +139,7 @@ class Updates:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
+        """Restores a state of :meth:`state_dict`."""
         self.optimiser.load_state_dict(state["optimiser"])
         self.schedule.load_state_dict(state["schedule"])
         self.skipped, self.in_a_row, self._count = state["skipped"], state["in_a_row"], state["count"]

@@ -25,28 +25,28 @@ __all__ = ["DEnKFTransform"]
 
 
 class DEnKFTransform(Checked, Transform):
-    """Filters an environment's observations: appends the belief to what the environment emits.
+    """Filters an environment's observations, and adds the belief to them.
 
-    At reset the belief is the filter's initial belief (of the rows that reset; the others keep theirs bit for bit).
+    At reset the belief is the filter's initial belief (in the rows that reset; the others are unchanged).
     At each step the belief at t and the action lead to the forecast, the new observation to the belief at t+1::
 
         root:  observation[t]    belief[t]    action[t]
         next:  observation[t+1]  belief[t+1]            <- filter.step(belief[t], action[t], observation[t+1])
 
     The belief is part of the observation spec and of the state spec, so batched environments, collectors, partial
-    resets and replay buffers carry it; nothing is kept on the transform. A belief that is passed to
-    ``env.reset(tensordict)`` without a ``"_reset"`` mask is taken as the prior. Randomness comes from torch's global
-    generator and does not depend on ``.training``. Workers differ; those that are *forked* (spawning is torchrl's
+    resets and replay buffers carry it; nothing is stored in the transform. A belief that is passed to
+    ``env.reset(tensordict)`` without a ``"_reset"`` mask is used as the prior. Randomness comes from torch's global
+    generator and does not depend on ``.training``. Workers differ; *forked* workers (spawning is torchrl's
     default) start from copies of one generator and draw the same noise until ``env.set_seed`` is called.
 
     In a replay buffer (or called on a tensordict ``[*B, T]``, time last) the transform filters whole sequences, see
     :class:`~torch_denkf.filters.Filter`.
 
     A filter belongs either here or into the policy, not both: a policy's filter would start from a belief that has seen
-    the frame already, and count each reading twice. In one process a warning says so; across processes, or where the
-    belief is copied on its way, it is not noticed. Behind this transform, torchrl's ``FrameSkipTransform`` makes
-    one step of the belief a skip, with the last frame; put it in front, where it skips for the environment alone. With
-    groups of agents, the belief is the environment's, and is reset where the environment's own ``done`` says so; an
+    the frame already, and use each reading twice. In one process this raises a warning; across processes, or if the
+    belief is copied in between, it is not detected. After this transform, torchrl's ``FrameSkipTransform`` makes one
+    step of the belief a skip, with the last frame; put it before this one, where it repeats only the environment's
+    steps. With groups of agents, the belief is the environment's, and is reset by the environment's own ``done``; an
     environment without one raises an error.
 
     Args:
@@ -55,23 +55,23 @@ class DEnKFTransform(Checked, Transform):
             ``initial`` belief.
         initial: the initial belief of a plain ``TensorDictSequential``.
         diagnostics: further outputs of the filter to keep, e.g. ``[("info", "nis")]``; zero at reset.
-        store_ensemble: if ``False``, rollouts and collected data hold means and variances alone; the
-            ensemble still flows from step to step, as ``("belief", "_ensemble")``, a private key that torchrl's
+        store_ensemble: if ``False``, rollouts and collected data have only means and variances; the
+            ensemble still passes from step to step, as ``("belief", "_ensemble")``, a private key that torchrl's
             collectors leave out of their data. Only outside a ``SerialEnv`` or ``ParallelEnv``.
         no_grad: whether environment steps record no graph (training recomputes the sequence). A graph through a
             rollout grows with every step, so this is on by default.
-        check_finite: whether a belief that is not finite raises; on a GPU, which a step would wait for, none does.
-            Where an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings`` in
-            front.
-        ahead: writes the belief of a later moment beside that of now: :class:`~torch_denkf.fusion.BeliefAhead`.
+        check_finite: whether a belief that is not finite raises; not on a GPU, for which a step would have to wait.
+            If an environment emits readings that are not finite, put ``torch_denkf.imperfect.RejectReadings``
+            before this transform.
+        ahead: also writes the belief of a later time: :class:`~torch_denkf.fusion.BeliefAhead`.
         packaged: the filter's step compiled ahead of time, from :func:`torch_denkf.deployment.load_step` (native code:
             load only what you would execute). At B=1 it is ten times as fast as the filter itself. It has the
-            parameters of its export, is for environments of the batch size of the export, and not for use inside a
+            parameters of its export, supports only the batch size of the export, and cannot be used inside a
             worker, because it cannot be pickled. Resets and specs come from ``filter``.
 
     Raises:
         TypeError: if ``filter`` is neither a filter nor a ``TensorDictSequential`` with ``initial``.
-        KeyError: if the environment does not emit what the filter reads, or the belief got lost on the way.
+        KeyError: if the environment does not emit the inputs of the filter, or the belief was lost between steps.
         ValueError: if the filter's result is not finite, or shapes do not fit.
 
     Example:
@@ -105,7 +105,7 @@ class DEnKFTransform(Checked, Transform):
                 )
             filter = Filter(*filter._module_iter(), initial=initial)
         elif initial is not None:
-            raise TypeError("A Filter has its initial belief already; give initial= with a TensorDictSequential only.")
+            raise TypeError("A Filter has its initial belief already; pass initial= only with a TensorDictSequential.")
         structure, written = filter.structure, filter.structure.out_keys
         inner = {filter.outer(key): key for key in written}
         further = [inner.get(key, key) for key in map(unravel_key, diagnostics)]
@@ -146,7 +146,7 @@ class DEnKFTransform(Checked, Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._packaged is not None:
             kept = self._packaged(tensordict, next_tensordict)
-            if kept is not None:  # otherwise what follows says what is missing
+            if kept is not None:  # otherwise the code below raises for the missing entry
                 return self._emit({}, kept, next_tensordict)
         entries = {}
         for key in self.filter.structure.carry:
@@ -155,7 +155,7 @@ class DEnKFTransform(Checked, Transform):
             if value is None:
                 raise KeyError(
                     f"DEnKFTransform carries the belief in {name!r}, but the tensordict passed to env.step() lacks it. "
-                    "Start from env.reset(), and pass on what step_mdp() or env.step_and_maybe_reset() return."
+                    "Start from env.reset(), and pass on the result of step_mdp() or env.step_and_maybe_reset()."
                 )
             entries[key] = value
         self._copy(tensordict, entries, self._controls, "the tensordict passed to env.step()")
@@ -192,14 +192,14 @@ class DEnKFTransform(Checked, Transform):
             start = self.filter.initialise(tensordict_reset.copy())
             lacking = [key for key in self._keep if start.get(self.filter.outer(key), None) is None]
             if lacking:
-                # Diagnostics of an update that did not take place: zeros of the shapes that an update gives.
+                # Diagnostics of an update that did not take place: zeros in the shapes of an update.
                 template = self._trial(start.copy())
                 for key in lacking:
                     start.set(self.filter.outer(key), torch.zeros_like(template[key]))
         given = {key: tensordict.get(key, None) for key in self.filter.carry_keys} if tensordict is not None else {}
         lacking = [key for key, value in given.items() if value is None]
         if lacking and len(lacking) < len(given) and not self._dropped_keys:
-            cure = "env.reset() takes a whole belief, or nothing of it."
+            cure = "Pass a complete belief to env.reset(), or none."
             raise diagnosis().missing_entry(type(self).__name__, lacking, tensordict.keys(True, True), cure)
         if given and not lacking:
             mask = self._reset_mask(tensordict)
@@ -221,11 +221,11 @@ class DEnKFTransform(Checked, Transform):
         masks = [mask for mask in (tensordict.get(key, None) for key in keys) if mask is not None]
         if not masks:
             return None
-        # The belief is the environment's: it is reset where any group or agent does.
+        # The belief is the environment's: it is reset if any group or agent is reset.
         return torch.stack([mask.reshape(*tensordict.batch_size, -1).any(-1) for mask in masks]).any(0)
 
     def _trial(self, row: TensorDictBase) -> dict[NestedKey, torch.Tensor]:
-        """Returns all that a step from ``row`` without actions writes."""
+        """Returns all outputs of a step from ``row`` without actions."""
         if self._controls:
             actions = self.parent.full_action_spec.zero()
             self._copy(actions, row, self._controls, "the environment's action spec")
@@ -236,9 +236,9 @@ class DEnKFTransform(Checked, Transform):
             value = source.get(key, None)
             if value is None:
                 cure = (
-                    f"Looked for in {owner}. Rename the key in the filter's sub-model, or put a transform that writes "
-                    "it before DEnKFTransform. It must also declare it, in its transform_observation_spec; a function "
-                    "in the place of a transform declares nothing."
+                    f"It was expected in {owner}. Rename the key in the filter's sub-model, or put a transform that "
+                    "writes it before DEnKFTransform. That transform must also declare it, in its "
+                    "transform_observation_spec; a function in the place of a transform declares nothing."
                 )
                 raise diagnosis().missing_entry("The filter", [key], source.keys(True, True), cure)
             target[key] = value
@@ -246,7 +246,7 @@ class DEnKFTransform(Checked, Transform):
     # ------------------------------------------------------------------------------------------------- the specs
 
     def _add_specs(self, spec: Composite, keys: Sequence[NestedKey], observation_spec: Composite) -> Composite:
-        """Adds to ``spec`` what the filter writes under ``keys`` on observations that are all zero."""
+        """Adds to ``spec`` the outputs of the filter under ``keys``, for observations that are all zero."""
         dtypes = {p.dtype for p in (*self.filter.parameters(), *self.filter.buffers()) if p.is_floating_point()}
         probe = observation_spec.zero()
         row = TensorDict({}, observation_spec.shape, device=observation_spec.device)
@@ -259,7 +259,7 @@ class DEnKFTransform(Checked, Transform):
                     "torchrl's DoubleToFloat() before DEnKFTransform, or convert the filter with filter.double()."
                 )
         row.update(probe)
-        # The shapes come from a trial; it must not use up random numbers.
+        # The shapes come from a trial step, which must not consume random numbers.
         cuda = [row.device] if row.device is not None and row.device.type == "cuda" else []
         with torch.no_grad(), torch.random.fork_rng(devices=cuda), set_recurrent_mode(False):
             written = self._trial(self.filter.initialise(row))
@@ -275,8 +275,8 @@ class DEnKFTransform(Checked, Transform):
         """Adds the belief and the diagnostics.
 
         Raises:
-            ValueError: if the environment emits an entry of such a name already, or resets groups of agents alone; or
-                if a transform behind this one writes over the belief that the filter goes on with.
+            ValueError: if the environment emits an entry of the same name already, or resets only groups of agents; or
+                if a later transform overwrites the belief from which the filter continues.
         """
         keys = [key for key in self._keep if key not in self._dropped_keys]
         check_no_group_resets(self.parent.reset_keys, self.out_keys)
@@ -284,13 +284,13 @@ class DEnKFTransform(Checked, Transform):
         taken = [name for name in self.out_keys if name in observation_spec.keys(True, True)]
         if taken:
             raise ValueError(
-                f"The environment emits {taken[0]!r} already, as that of another filter: one would start from the "
-                'belief of the other. Give this filter a name of its own, prefix="imu" for example.'
+                f"The environment emits {taken[0]!r} already, for another filter: one would start from the "
+                'belief of the other. Give this filter a prefix, prefix="imu" for example.'
             )
         return self._add_specs(observation_spec, keys, observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Adds what the filter carries from step to step to the state spec."""
+        """Adds the carry of the filter to the state spec."""
         if input_spec.get("full_state_spec", None) is None:
             input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
         observation_spec = self.parent.full_observation_spec.clone()
@@ -301,8 +301,8 @@ class DEnKFTransform(Checked, Transform):
     # --------------------------------------------------------------------------------------------------- storage
 
     def _post_step_mdp_hooks(self, tensordict, tensordict_):
-        # What is stored loses the ensemble, in place, because that is what collectors look at; what flows on to the
-        # next step gets it here, because torchrl's step_mdp takes over what the specs hold, and no more.
+        # The ensemble is removed from the stored data in place, because collectors read that object, and is added here
+        # to the input of the next step, because torchrl's step_mdp keeps only entries of the specs.
         if not self._dropped_keys:
             return tensordict, tensordict_
         names = [self._names[key] for key in self._dropped_keys]
@@ -327,10 +327,10 @@ class DEnKFTransform(Checked, Transform):
         """Filters a sequence ``[*B, T]``, e.g. a sample of a replay buffer; see :class:`Filter`.
 
         torchrl's buffers apply their transforms before ``SliceSampler`` marks the slices: a buffer of flat slices is
-        an error. Filter what it returns, or store whole windows ``[T]`` as its items.
+        an error. Filter its samples instead, or store whole windows ``[T]`` as its items.
 
         Raises:
-            ValueError: if a flat batch seems to hold several sequences that are not marked.
+            ValueError: if a flat batch seems to have several unmarked sequences.
         """
         self.filter.observe(Record("data", tensordict, tensordict.batch_size, {}, {}))
         with self._grad_mode(), set_recurrent_mode(True):

@@ -12,14 +12,14 @@ __all__ = ["LastAction", "check_no_group_resets"]
 
 
 def check_no_group_resets(reset_keys: Sequence[NestedKey], kept: Iterable[NestedKey]) -> None:
-    """Raises where torchrl would not reset what is kept: it resets the entries of the group that is done, no others.
+    """Raises if torchrl would not reset an entry, because it resets only entries of the group that is done.
 
     Args:
-        reset_keys: of the environment.
+        reset_keys: reset keys of the environment.
         kept: keys that are reset with each episode.
 
     Raises:
-        ValueError: if episodes end in groups of agents alone, and an entry stands outside of them.
+        ValueError: if episodes end only in groups of agents, and an entry is outside of them.
     """
     groups = [key[:-1] for key in map(unravel_key, reset_keys) if isinstance(key, tuple)]
     if "_reset" in reset_keys or not groups:
@@ -27,22 +27,22 @@ def check_no_group_resets(reset_keys: Sequence[NestedKey], kept: Iterable[Nested
     for key in kept:
         if not any(key[: len(group)] == group for group in groups):
             raise ValueError(
-                f"Episodes of this environment end in {groups[0]} alone, and torchrl then keeps what stands outside of "
-                f"that group, as {key!r} would: the belief would go on from the episode before. Give the environment a "
-                "done of its own, at the root; or, where the group has the batch size of the environment, give the "
-                f"filter the name of the group, prefix={groups[0][0]!r}."
+                f"Episodes of this environment end only in {groups[0]}, and torchrl does not reset entries outside of "
+                f"that group, such as {key!r}: the belief would continue from the episode before. Give the environment "
+                "its own done, at the root; or, if the group has the batch size of the environment, give the filter "
+                f"the name of the group, prefix={groups[0][0]!r}."
             )
 
 
 class LastAction(TensorDictPrimer):
-    """Keeps the action that led to an observation, as ``("previous", "action")`` next to it; zero after a reset.
+    """Stores the action that led to an observation, as ``("previous", "action")``; zero after a reset.
 
     A filter in a policy runs before the next action is chosen, and needs the last one.
-    :meth:`torch_denkf.filters.Filter.make_tensordict_primer` brings it where actions drive the filter; append it
-    yourself where a policy reads the last action for another reason.
+    :meth:`torch_denkf.filters.Filter.make_tensordict_primer` includes it if actions drive the filter; append it
+    yourself if a policy reads the last action for another reason.
 
     Args:
-        actions: names of actions, and where to keep the last one; ``{"action": ("previous", "action")}`` by default.
+        actions: maps names of actions to keys of the last ones; ``{"action": ("previous", "action")}`` by default.
         primers: further entries to carry, see :class:`torchrl.envs.transforms.TensorDictPrimer`.
 
     Example:
@@ -60,7 +60,7 @@ class LastAction(TensorDictPrimer):
         self._carried = list(self.primers.keys(True, True))
 
     def _with_actions(self) -> None:
-        """Adds the actions' shapes, which only the environment knows."""
+        """Adds the actions' shapes, which are known from the environment only."""
         for key, kept in self.actions.items():
             if kept not in self.primers.keys(True, True):
                 spec = self.parent.full_action_spec[key]
@@ -70,11 +70,11 @@ class LastAction(TensorDictPrimer):
                 self.default_value[kept] = 0.0
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds what is carried.
+        """Adds the carried entries.
 
         Raises:
-            ValueError: if another transform carries an entry of the same name, or the environment resets groups of
-                agents alone.
+            ValueError: if another transform carries an entry of the same name, or the environment resets only groups
+                of agents.
         """
         self._with_actions()
         if self.parent is not None:
@@ -83,12 +83,12 @@ class LastAction(TensorDictPrimer):
         if taken:
             raise ValueError(
                 f"The environment carries {taken[0]!r} already, for another filter of the policy: both would start "
-                'from one belief. Give one of them a name of its own, prefix="imu" for example.'
+                'from one belief. Give one of them a prefix, prefix="imu" for example.'
             )
         return super().transform_observation_spec(observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Adds what is carried to the state."""
+        """Adds the carried entries to the state."""
         self._with_actions()
         return super().transform_input_spec(input_spec)
 

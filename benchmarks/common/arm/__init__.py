@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-JOINTS = 7  # of each arm: the first numbers of a state, in rad
+JOINTS = 7  # of each arm: the first components of a state, in rad
 
 
 @dataclass(frozen=True)
 class Roles:
-    """Numbers of recorded sequences by what they are for.
+    """Indices of recorded sequences by their use.
 
-    Filters learn from sequences that their sensor has not seen: they must see how wrong it is on new ones.
+    Filters learn from sequences that their sensor was not trained on, because its errors on those are larger.
     """
 
     sensor: list[int]  # train the sensor and the motion
     tune: list[int]  # train the filters
-    validation: list[int]  # choose
+    validation: list[int]  # choose settings
     test: list[int]
 
     def __post_init__(self):

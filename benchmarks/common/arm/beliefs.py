@@ -1,4 +1,4 @@
-"""Beliefs of whole sequences that a study leaves on disk, and their pictures: numbers with bands."""
+"""Saves beliefs of whole sequences, and plots them with bands."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 
 def save_belief(file: Path, mean: Tensor, var: Tensor, state: Tensor, observed: Tensor, **others: Tensor) -> None:
-    """Leaves a belief ``[T, D]`` of one sequence, its truth, and where the camera was seen ``[T, 1]``."""
+    """Saves a belief ``[T, D]`` of one sequence, its truth, and the observed mask of the camera ``[T, 1]``."""
     entries = {"mean": mean, "var": var, "state": state, "observed": observed, **others}
     write_checkpoint(file, {key: value.clone() for key, value in entries.items()})  # without the rest of a batch
 
 
 def draw_beliefs(out: Path, names: Sequence[str], factors: Sequence[float], time: float) -> Iterator[Path]:
-    """Draws all numbers over time: truth, mean, 90 % band, and the sensor's ``"reading"`` where there is one.
+    """Draws all components over time: truth, mean, 90 % band, and the sensor's ``"reading"`` if there is one.
 
     Args:
         out: folder of the study.
-        names: of the numbers, with their units.
-        factors: into these.
+        names: of the components, with their units.
+        factors: that convert to these units.
         time: s of a row.
 
     Yields:
-        the files, in ``out/pictures``.
+        the plots' files, in ``out/pictures``.
 
     Raises:
         FileNotFoundError: without beliefs.

@@ -1,4 +1,4 @@
-"""A second look: convolutions on a patch of a picture at full resolution."""
+"""A network that looks at a patch of an image at full resolution."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ FEATURES = 192  # of a patch
 
 
 class CloseLook(nn.Module):
-    """Looks closely at a place of a picture, where something is a dozen pixels wide in the whole of it.
+    """Maps a patch of an image at full resolution to features, for objects that are a dozen pixels wide.
 
-    The patch costs as much as the whole picture at a third of its resolution.
+    The patch costs as much as the whole image at a third of its resolution.
 
     Args:
-        picture: width in pixels.
-        reach: half a patch's side, in half pictures.
+        picture: width of the image in pixels.
+        reach: half a patch's side, in half images.
         dropout: in front of the last layer; 0 for none.
-        half: whether convolutions have 16 bits: half the time on a processor that has them.
+        half: whether convolutions have 16 bits, which takes half the time on a processor that supports them.
     """
 
     def __init__(self, picture: int, reach: float, dropout: float = 0.0, half: bool = False):
@@ -27,19 +27,19 @@ class CloseLook(nn.Module):
         self.close = nn.Sequential(
             *_block(5, 32, 5, 2), *_block(32, 48, 3, 2), *_block(48, 64, 3, 1), *_block(64, 96, 3, 2), nn.Flatten()
         )
-        patch = 8 * max(round(reach * picture / 8), 1)  # about a pixel of the picture each
+        patch = 8 * max(round(reach * picture / 8), 1)  # about one pixel of the image for each of the patch
         self.squeeze = nn.Sequential(nn.Linear(96 * (patch // 8) ** 2, FEATURES), nn.ReLU())
         self.dropout = nn.Dropout(dropout)
         side = torch.linspace(-1, 1, patch)
         self.register_buffer("grid", torch.stack(torch.meshgrid(side, side, indexing="xy"), -1), persistent=False)
 
     def forward(self, images: Tensor, centre: Tensor, raised: float = 0.0) -> Tensor:
-        """Features ``[N, 192]`` of images ``[N, 3, H, W]`` around places ``[N, 2]`` from -1 (left, top) to 1.
+        """Returns features ``[N, 192]`` of images ``[N, 3, H, W]`` around places ``[N, 2]`` from -1 (left, top) to 1.
 
         Args:
             images: at full resolution.
             centre: columns and rows.
-            raised: how far above them the patch's middle is.
+            raised: distance of the patch's middle above them.
         """
         aspect = images.shape[-1] / images.shape[-2]
         way = self.reach * self.grid * self.grid.new_tensor([1.0, aspect])
@@ -52,16 +52,16 @@ class CloseLook(nn.Module):
 
 
 class GlimpseTrunk(nn.Module):
-    """Looks at the whole picture, and closely at the hand, which is a dozen pixels wide in it.
+    """Trunk that sees the whole image, and a patch around the hand, which is a dozen pixels wide.
 
     Args:
-        coarse: sees the whole picture, ``[N, 3, H, W]`` to ``[N, F]``.
-        close: looks at the patch.
+        coarse: maps the whole image, ``[N, 3, H, W]`` to ``[N, F]``.
+        close: maps the patch to features.
         size: F.
-        raised: how far above the hand's place the patch's middle is.
+        raised: distance of the patch's middle above the hand's place.
         dropout: in front of the last layer.
-        told: whether the last two features are where it looks, columns and rows from -1 (left, top) to 1. Train them to
-            be the hand: what the patch shows teaches where to look no better.
+        told: whether the last two features are the patch's place, columns and rows from -1 (left, top) to 1. Train them
+            to be the hand's place: no gradient reaches them through the patch.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class GlimpseTrunk(nn.Module):
         self.raised, self.told = raised, told
 
     def forward(self, images: Tensor) -> Tensor:
-        """Features ``[N, 256]`` of images."""
+        """Returns features ``[N, 256]`` of images."""
         code = self.coarse(images)
         centre = self.centre(code)
         patch = self.close(images, centre.detach() if self.told else centre, self.raised)

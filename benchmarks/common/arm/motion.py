@@ -1,4 +1,4 @@
-"""Motions of arms: networks that are trained on true states before any filter is, and further with each filter."""
+"""Motions of arms: networks that are first trained on true states, and then further with each filter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch_denkf.training.parts import train_part
 
 
 def with_rates(states: Tensor, order: int) -> Tensor:
-    """States ``[*, T, D]`` with the joints' changes along time, and those of the changes; an episode begins at rest."""
+    """Returns states ``[*, T, D]`` with their first and second differences in time; an episode begins at rest."""
     parts, values = [states], states[..., :JOINTS]
     for _ in range(order):
         values = torch.cat([torch.zeros_like(values[..., :1, :]), values.diff(dim=-2)], -2)
@@ -24,18 +24,18 @@ def with_rates(states: Tensor, order: int) -> Tensor:
 
 
 class ArmMotion(nn.Module):
-    """A motion one row on, of which a network says how the rates change.
+    """Motion over one row, with a network that predicts the change of the rates.
 
     Args:
-        inputs: of that network.
+        inputs: dimension of the network's input.
         **units: buffers; ``acceleration`` is the unit of the loss.
 
     Attributes:
-        size: numbers of the state.
-        read: its first numbers, which the sensor reads.
-        fading: of the sensor's bias in a row, before training.
+        size: dimension of the state.
+        read: number of its first components that the sensor reads.
+        fading: decay factor of the sensor's bias per row, before training.
         actions: whether commands follow the state in the input.
-        scored: numbers that it is trained on.
+        scored: components of the state in the loss.
     """
 
     size: int
@@ -55,9 +55,9 @@ class ArmMotion(nn.Module):
         nn.init.zeros_(self.accelerate[-1].bias)
 
     def losses(self, rows: TensorDict) -> dict[str, Tensor]:
-        """Absolute errors of some rows, the k-th counting 1 / k, on a ``"path"`` ``[N, A + 1, S]`` of true states.
+        """Returns absolute errors of A steps, the k-th weighted by 1 / k, on true states, ``"path"`` ``[N, A + 1, S]``.
 
-        Commands follow the states where there are some.
+        Commands, if any, follow the states.
         """
         path, terms = rows["path"], []
         state = path[:, 0, : self.size]
@@ -69,27 +69,27 @@ class ArmMotion(nn.Module):
 
 
 class BiasedReading(nn.Module):
-    """h: the first numbers of a state, with the sensor's errors of them where the state holds those."""
+    """Measurement model h: the first components of a state, plus the sensor's biases if the state has them."""
 
     def __init__(self, motion: ArmMotion):
         super().__init__()
         self.read, self.size = motion.read, motion.size
 
     def forward(self, state: Tensor) -> Tensor:
-        """Readings ``[*, read]`` of states ``[*, size]`` or ``[*, size + read]``."""
+        """Returns readings ``[*, read]`` of states ``[*, size]`` or ``[*, size + read]``."""
         place, bias = state[..., : self.read], state[..., self.size :]
         return place + bias if bias.shape[-1] else place
 
 
 class WithBias(nn.Module):
-    r"""The motion of a state that also holds the sensor's slow errors, which fade: :math:`b_t = \rho \circ b_{t-1}`.
+    r"""Motion of a state that includes the sensor's biases, which decay: :math:`b_t = \rho \circ b_{t-1}`.
 
-    A sensor that reads a pose wrongly reads it wrongly in the next frame, too. A filter that takes its errors for white
-    noise believes them more with each frame; here they are part of the state, and the reading is state plus bias
-    ("coloured measurement noise": Bryson & Henrikson 1968).
+    The errors of a sensor on consecutive frames are similar. A filter that takes them for white noise becomes ever more
+    certain of them; here they are part of the state, and the reading is state plus bias ("coloured measurement noise":
+    Bryson & Henrikson 1968).
 
     Args:
-        motion: of the state without them.
+        motion: of the state without biases.
     """
 
     def __init__(self, motion: ArmMotion):
@@ -98,7 +98,7 @@ class WithBias(nn.Module):
         self.fading = nn.Parameter(torch.full((motion.read,), motion.fading).logit())
 
     def forward(self, features: Tensor) -> Tensor:
-        """States ``[*, size + read]`` of such states, or of states and commands."""
+        """Returns the next states ``[*, size + read]`` from such states, or from states and commands."""
         size, whole = self.motion.size, self.motion.size + self.motion.read
         moved = self.motion(torch.cat([features[..., :size], features[..., whole:]], -1))
         return torch.cat([moved, self.fading.sigmoid() * features[..., size:whole]], -1)
@@ -107,13 +107,13 @@ class WithBias(nn.Module):
 def train_motion(
     motion: ArmMotion, sequences: Sequence[Tensor], ahead: int, *, out: Path, seed: int, updates: int
 ) -> ArmMotion:
-    """Trains a motion on sequences ``[T, S]`` of true states, or reads it where that was done.
+    """Trains a motion on sequences ``[T, S]`` of true states, or loads it if it was trained before.
 
     Args:
         motion: trained in place.
-        sequences: states, and commands behind them if there are some; the last tenth validates.
-        ahead: rows that the motion runs by itself: what errs little in one row may err much in ten.
-        out: checkpoints and logs.
+        sequences: states, followed by commands if there are any; the last tenth validates.
+        ahead: rows that the motion predicts recursively, because a small error in one row may grow in ten.
+        out: folder for checkpoints and logs.
         seed: of all random numbers.
         updates: of 256 stretches each.
     """

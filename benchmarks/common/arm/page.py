@@ -25,14 +25,13 @@ SIZES = {
 
 
 def page(frame: pd.DataFrame, methods: Sequence[str], joints: Sequence[str], lines: Sequence[str]) -> str:
-    """The tables of a study's rows, means over seeds.
+    """Returns the tables of a study's rows, means over seeds.
 
     Args:
         frame: rows of all conditions.
-        methods: columns that tell filters apart; ensembles of a size that ran on clean pictures alone have a table of
-            their own.
+        methods: columns that tell filters apart; ensemble sizes that ran only on clean images have a separate table.
         joints: names.
-        lines: that stand before them.
+        lines: text before the tables.
     """
     methods = list(methods)
     seeds = frame["seed"].nunique()

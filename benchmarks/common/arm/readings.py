@@ -1,7 +1,7 @@
-"""Reads whole sequences by a camera sensor, with failing cameras; and windows of that, to train filters on.
+"""Reads whole sequences by a camera sensor, with camera faults, and draws windows of them to train filters on.
 
-A sensor's trunk stays as it is when filters are trained. Its features of every frame are computed once, and its
-stochastic head runs on those: afterwards a filter, of any ensemble size, costs no pictures.
+A sensor's trunk is frozen when filters are trained. Its features of every frame are computed once, and its stochastic
+head runs on those, so that training a filter, of any ensemble size, processes no images.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BLACK, MISSING = 20, 0.3  # consecutive black frames; share of frames that do no
 
 
 def code_of(sensors: Sequence[ImageSensor], pixels: Tensor) -> Tensor:
-    """Features of the sensors' trunks, one behind the other, ``[N, F]``, of pictures ``[N, 3, H, W]``."""
+    """Returns concatenated features of the sensors' trunks ``[N, F]`` of images ``[N, 3, H, W]``."""
     return torch.cat([sensor._features(pixels, None) for sensor in sensors], -1)
 
 
@@ -34,15 +34,15 @@ def read_codes(
     see: Callable[[TensorDict], TensorDict],
     file: Path,
 ) -> TensorDict:
-    """Features of all frames of some sequences ``[N, T]``, the shorter ones filled up; kept in a file.
+    """Returns features of all frames of some sequences ``[N, T]``, padded to one length, and caches them in a file.
 
     Args:
-        sensors: whose trunks look.
+        sensors: whose trunks run.
         data: the recordings.
         sequences: rows of each.
-        see: maps rows ``[n]`` of the data to ``"pixels"``, maybe of a failing camera, and other entries to keep.
-        file: with ``"code"`` ``[N, T, F]``, these entries, and ``[N, T, 1]`` each: ``"observed"``, whether a picture is
-            new and not black, ``"arrived"``, whether one came, and ``"valid"``, whether the sequence goes on.
+        see: maps rows ``[n]`` of the data to ``"pixels"``, maybe with a camera fault, and other entries to keep.
+        file: with ``"code"`` ``[N, T, F]``, these entries, and ``[N, T, 1]`` each: ``"observed"``, whether an image is
+            new and not black, ``"arrived"``, whether one came, and ``"valid"``, whether the sequence continues.
     """
     if not file.exists():
         check, parts = BlackIsMissing(), []
@@ -52,7 +52,7 @@ def read_codes(
             part = torch.cat(codes).rename_key_("seen", "observed")
             parts.append(part.set("valid", torch.ones_like(part["observed"])))
         longest = max(map(len, parts))
-        for number, part in enumerate(parts):  # the last row stays
+        for number, part in enumerate(parts):  # pad by repeating the last row
             filled = part[torch.arange(longest).clamp(max=len(part) - 1)]
             over = torch.arange(longest).unsqueeze(-1) >= len(part)
             masks = {key: filled[key] & ~over for key in ("observed", "valid")}
@@ -65,10 +65,10 @@ def read_codes(
 def read_heads(
     sensors: Sequence[ImageSensor], code: Tensor, size: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Samples ``[*B, size, O]`` and encoding ``[*B, F]`` of the sensors' heads, of features ``[*B, F]``.
+    """Returns samples ``[*B, size, O]`` and encoding ``[*B, F]`` of the sensors' heads, from features ``[*B, F]``.
 
-    The samples are split among the sensors, which were trained from different random numbers: their spread is also that
-    of what training leaves open.
+    The samples are split among the sensors, which were trained from different seeds, so that their spread includes the
+    uncertainty of training.
     """
     parts, hidden = [], []
     for k, (sensor, own) in enumerate(zip(sensors, code.chunk(len(sensors), -1), strict=True)):
@@ -83,7 +83,7 @@ def read_heads(
 def with_head(
     sensors: Sequence[ImageSensor], codes: TensorDict, size: int, generator: torch.Generator | None = None
 ) -> TensorDict:
-    """Codes with ``("sensor", "ensemble")`` and ``("sensor", "encoding")`` in the place of features."""
+    """Returns the entries with ``("sensor", "ensemble")`` and ``("sensor", "encoding")`` instead of features."""
     samples, encoding = read_heads(sensors, codes["code"], size, generator)
     out = codes.exclude("code")
     out["sensor"] = TensorDict({"ensemble": samples, "encoding": encoding}, batch_size=out.batch_size)
@@ -92,19 +92,19 @@ def with_head(
 
 @torch.no_grad()
 def read_all(sensors: Sequence[ImageSensor], codes: TensorDict, size: int, seed: int = 0) -> TensorDict:
-    """Reads whole collections, a sequence at a time, from the same random numbers each time."""
+    """Runs the heads on all sequences, one at a time, with the same seed in each call."""
     generator = torch.Generator().manual_seed(seed)
     return torch.cat([with_head(sensors, part, size, generator) for part in codes.split(1)])
 
 
 def blackouts(lengths: Tensor, seed: int = 0) -> Tensor:
-    """Draws where the black frames begin, ``[N]``: in the middle half of each sequence."""
+    """Draws the first black frame of each sequence ``[N]``, in its middle half."""
     share = torch.rand(len(lengths), generator=torch.Generator().manual_seed(seed))
     return (lengths * (0.25 + 0.5 * share)).long()
 
 
 def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
-    """Readings ``[N, T]`` of a camera that fails, ``"black20"`` or ``"missing"``; in other conditions as they are."""
+    """Returns readings ``[N, T]`` under a camera fault, ``"black20"`` or ``"missing"``; otherwise unchanged."""
     count, steps = readings.shape
     if condition == "missing":
         return without(readings, torch.rand(count, steps, 1, generator=torch.Generator().manual_seed(seed)) < MISSING)
@@ -115,7 +115,7 @@ def fail(readings: TensorDict, condition: str, seed: int = 0) -> TensorDict:
 
 
 def without(readings: TensorDict, lost: Tensor) -> TensorDict:
-    """Readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``, of which nothing is left."""
+    """Returns readings ``[N, T]`` without the frames that are ``lost`` ``[N, T, 1]``: masked and set to zero."""
     out = readings.copy()
     for key in ("observed", "arrived"):
         out[key] = out[key] & ~lost
@@ -128,12 +128,12 @@ def without(readings: TensorDict, lost: Tensor) -> TensorDict:
 
 
 class Windows:
-    """Draws windows of readings or of features, with failing cameras.
+    """Draws windows of readings or of features, with camera faults.
 
     Args:
         readings: of conditions, ``[N, T]`` each.
         length: of the windows.
-        shares: of the windows, by condition; by default, sequences are drawn alike.
+        shares: of the windows, by condition; by default, all sequences have the same probability.
     """
 
     def __init__(self, readings: Sequence[TensorDict], length: int, shares: Sequence[float] | None = None):
@@ -146,7 +146,7 @@ class Windows:
         self.weights = (shares / counts).repeat_interleave(counts)
 
     def sample(self, generator: torch.Generator, batch: int, length: int | None = None) -> TensorDict:
-        """Windows ``[batch, length]``: in half of them up to half of the frames are missing, in a third a stretch."""
+        """Returns windows ``[batch, length]``; half of them have missing frames, a third a gap."""
         length = length or self.length
 
         def draw(*shape: int) -> Tensor:
@@ -156,7 +156,7 @@ class Windows:
         first = (draw() * (self.lengths[which] - length + 1)).long()
         windows = self.all[which.unsqueeze(-1), first.unsqueeze(-1) + torch.arange(length)]
         lost = draw(length, 1) < draw(1, 1) - 0.5
-        lost[:, 0] = False  # what a window begins around
+        lost[:, 0] = False  # the window's initial belief needs it
         begin, step = 1 + (draw(1) * (length - 1)).long(), torch.arange(length)
         end = begin + (draw(1) * (BLACK + 1)).long() * (draw(1) < 0.33)
         return without(windows, lost | ((step >= begin) & (step < end)).unsqueeze(-1))

@@ -18,11 +18,11 @@ from torch_denkf.modules.around import AroundInitial
 
 
 class AtRest(AroundInitial):
-    """An initial belief around the numbers that a sensor reads, of something that does not move.
+    """Initial belief around the components that a sensor reads, at rest.
 
     Args:
         initial: a belief around the filters' state.
-        size: of the filters' state; further numbers are zero.
+        size: of the filters' state; further components are zero.
         input_dim: D.
         state_key: ``[*B, D]``, or the filters' state.
     """
@@ -35,28 +35,28 @@ class AtRest(AroundInitial):
         self.input_dim = input_dim
 
     def on_entries(self, entries, call):
-        """The belief."""
+        """Returns the belief."""
         (key,) = self.in_keys
         state = self.required(entries, key)
         return self.run_inside({**entries, key: nn.functional.pad(state, (0, self.size - state.shape[-1]))}, call)
 
 
 class ArmRecipe(Recipe):
-    """A filter whose motion was trained before; all carry what is read in the first entries of their mean.
+    """A filter whose motion was trained before; the first entries of its mean are the components that the sensor reads.
 
     Attributes:
         actions: whether the motion reads the commands.
-        bias: whether the state holds the sensor's slow errors.
+        bias: whether the state has the sensor's biases.
         motion: trained before.
         members: of an ensemble.
-        process_std: what motion and bias do not know in a step before training, for each of ``noisy``.
+        process_std: process noise of motion and bias in a step before training, for each of ``noisy``.
         bias_std: of the bias.
         noisy: dimensions of the state that the process noise acts on.
-        rates: those of them that are rates, one for each moving number; or accelerations, or what else drives these.
-        moved: dimensions that the noise of ``rates`` moves in the same step, one after the other; by default the first.
+        rates: those of ``noisy`` that are rates or accelerations, one for each of ``moved``.
+        moved: groups of dimensions that the noise of ``rates`` moves in the same step; by default the first ones.
         first_key: entry with the state around which a sequence begins.
-        first_std: how far that is off, for each number of the motion's state.
-        start_std: how far windows of the training begin from ``"start"``, likewise.
+        first_std: standard deviations of that state, for each component of the motion's state.
+        start_std: standard deviations of ``"start"``, around which windows of the training begin.
         taper: factors on the ensemble's covariances of state and readings, and of the readings.
         scheme: of the ensemble's update.
         threshold: of the localisation by significance; ``None`` for none.
@@ -79,67 +79,67 @@ class ArmRecipe(Recipe):
 
     @property
     def moved(self) -> Sequence[Sequence[int]]:
-        """The first numbers of the state, as many as there are rates."""
+        """Returns the first dimensions of the state, as many as there are rates."""
         return (range(len(self.rates)),)
 
     @property
     def size(self) -> int:
-        """S, of the state."""
+        """Returns S, the dimension of the state."""
         return self.motion.size + self.motion.read * self.bias
 
     def transition(self) -> m.SubModel:
-        """The learned motion as a transition of ensembles."""
+        """Returns the learned motion as a transition of ensembles."""
         network = WithBias(self.motion) if self.bias else self.motion
         return m.LearnedTransition(network, residual=False, action_key="action" if self.actions else None)
 
     def process_noise(self) -> m.SubModel:
-        """Q of what is noisy."""
+        """Returns the process noise Q of the dimensions ``noisy``."""
         return m.ScaledNoise(self._process_noise())
 
     def _process_noise(self) -> m.SubModel:
         raise NotImplementedError
 
     def observation(self) -> m.SubModel:
-        """H."""
+        """Returns the measurement model."""
         return m.LearnedObservation(BiasedReading(self.motion))
 
     def belief(self, std: Tensor, state_key: NestedKey) -> TensorDictModuleBase:
-        """The belief around a state ``[*B, S]``."""
+        """Returns an initial belief around a state ``[*B, S]``."""
         raise NotImplementedError
 
     def initial(self, std: Tensor, state_key: NestedKey) -> TensorDictModuleBase:
-        """The belief around the numbers that are read, at rest, or around a whole state."""
+        """Returns the initial belief around a reading, at rest, or around a whole state."""
         whole = torch.cat([std, self.bias_std])[: self.size]
         return AtRest(self.belief(whole, state_key), self.size, self.motion.read, state_key)
 
     def build(self) -> Filter:
-        """The filter, on readings."""
+        """Returns the filter, with the sensor's readings as input."""
         return Filter(self.modules(), initial=self.initial(self.first_std, self.first_key))
 
     def behind(self, model: Filter, *, training: bool = False) -> Filter:
-        """Returns the same filter, sharing all parameters, on readings; for windows from ``"start"`` in training."""
+        """Returns the filter without its sensor, with shared parameters; in training, windows begin at ``"start"``."""
         parts = OrderedDict((name, model[name]) for name in model.module if name != "sensor")
         return Filter(parts, initial=self.initial(self.start_std, "start") if training else model.initial)
 
     def begun(self, windows: TensorDict, generator: torch.Generator) -> TensorDict:
-        """Windows with the loss's ``"target"``, in which biases are zero, and the ``"start"`` of their beliefs."""
+        """Adds to windows the loss's ``"target"``, with zero biases, and the ``"start"`` of their beliefs."""
         unknown = self.size - windows["motion"].shape[-1]
         windows["target"] = nn.functional.pad(windows["motion"], (0, unknown))
         windows["start"] = self.start(windows, generator)
         return windows
 
     def start(self, windows: TensorDict, generator: torch.Generator) -> Tensor:
-        """States ``[B, T, D]`` around which windows begin."""
+        """Returns the states ``[B, T, D]`` around which windows begin."""
         raise NotImplementedError
 
     @property
     def state_scale(self) -> Tensor:
-        """Units of the loss; what the sensor does not read does not count."""
+        """Returns the units of the loss, infinite for components without a weight in it."""
         return torch.cat([self.unit, torch.full((self.size - len(self.unit),), torch.inf)])
 
 
 class DEnKF(ArmRecipe):
-    """The differentiable ensemble Kalman filter; innovations are those of the sensor's samples."""
+    """The differentiable ensemble Kalman filter, with innovations of the sensor's samples."""
 
     def modules(self):
         localised = {} if self.threshold is None else {"localisation": "significance", "threshold": self.threshold}
@@ -170,7 +170,7 @@ class DEKF(ArmRecipe):
     Analysis: type = m.EKFAnalysis
 
     def forecast(self, noise: m.SubModel) -> m.SubModel:
-        """Mean and covariance a step on; its Jacobian is a constant to the gradient, as in Kloss et al."""
+        """Returns the EKF's prediction; its Jacobian is a constant to the gradient, as in Kloss et al."""
         return m.EKFTransition(self.transition(), noise, stop_jacobian_gradient=True)
 
     def modules(self):
@@ -194,7 +194,7 @@ class DUKF(DEKF):
     Analysis = m.UKFAnalysis
 
     def forecast(self, noise: m.SubModel) -> m.SubModel:
-        """Mean and covariance a step on."""
+        """Returns the UKF's prediction."""
         return m.UKFTransition(self.transition(), noise)
 
 

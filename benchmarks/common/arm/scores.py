@@ -21,16 +21,16 @@ from torch_denkf.functional.manifolds import Flat
 from torch_denkf.metrics import interval_coverage, state_errors
 from torch_denkf.training import Stage
 
-FLOOR = 1e-10  # least variance: particles that are all the same have none, and no likelihood
-AFTER = 15  # rows after a blackout at which the spread is taken again
+FLOOR = 1e-10  # least variance: identical particles have zero variance, and no likelihood
+AFTER = 15  # rows after a blackout at which the spread is measured again
 TIMED = 100  # rows to time a filter on
-PICTURED = 3  # sequences whose beliefs are left for the pictures
-READ = ("state", "motion", "valid", "arrived")  # what scores read, not filters
+PICTURED = 3  # sequences whose beliefs are saved for the plots
+READ = ("state", "motion", "valid", "arrived")  # entries that only the scores read
 
 
 @torch.no_grad()
 def run_filter(recipe: ArmRecipe, model: Filter, readings: TensorDict, chunk: int = 128) -> TensorDict:
-    """The readings ``[N, T]`` with the mean and variances of the belief about what is read."""
+    """Returns the readings ``[N, T]`` with the belief's mean and variances of the components that the sensor reads."""
     behind, beliefs = recipe.behind(model), []
     hidden = [key for key in READ if key != recipe.first_key]
     with torch.random.fork_rng(devices=[]):
@@ -42,30 +42,30 @@ def run_filter(recipe: ArmRecipe, model: Filter, readings: TensorDict, chunk: in
 
 
 def estimated(readings: TensorDict, mean: Tensor, var: Tensor) -> TensorDict:
-    """The readings ``[N, T]`` with an estimate that no filter made, ``[N, T, D]``."""
+    """Returns the readings ``[N, T]`` with an estimate ``[N, T, D]`` from elsewhere as their belief."""
     return readings.copy().set("belief", TensorDict({"mean": mean, "var": var}, readings.shape))
 
 
 def counted(out: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-    """Means, variances and truth ``[M, D]`` of all rows but a sequence's first, which is given."""
+    """Returns means, variances and truth ``[M, D]`` of all rows but a sequence's first, which is given."""
     at = out["valid"].squeeze(-1).clone()
     at[:, 0] = False
     return out["belief", "mean"][at], out["belief", "var"][at].clamp_min(FLOOR), out["state"][at]
 
 
 def coverage(out: TensorDict) -> Tensor:
-    """Share of the true joints inside the belief's 90 % intervals."""
+    """Returns the share of the true joints inside the belief's 90 % intervals."""
     return interval_coverage(*(value[:, :JOINTS] for value in counted(out)), level=0.9).mean()
 
 
 def absolute_errors(mean: Tensor, truth: Tensor, circular: Sequence[int]) -> Tensor:
-    """Means of absolute errors, ``[D]``: degrees of the joints, cm of a place behind them; some joints wrap."""
+    """Returns mean absolute errors ``[D]``: of the joints in degrees, then of a position in cm; some joints wrap."""
     error = state_errors(mean, truth, space=Flat(mean.shape[-1], circular=circular)).mae
     return torch.cat([error[:JOINTS].rad2deg(), 100 * error[JOINTS:]])
 
 
 def scores(out: TensorDict, names: Sequence[str], unit: Tensor, circular: Sequence[int] = ()) -> dict[str, float]:
-    """Errors, CRPS and coverage of beliefs ``[N, T]`` taken for Gaussians.
+    """Returns errors, CRPS and coverage of beliefs ``[N, T]``, approximated by Gaussians.
 
     Args:
         out: of :func:`run_filter`.
@@ -83,7 +83,7 @@ def scores(out: TensorDict, names: Sequence[str], unit: Tensor, circular: Sequen
 
 
 def blackout(out: TensorDict, circular: Sequence[int] = ()) -> dict[str, float]:
-    """Error of the joints in the black frames, and their mean standard deviation before, at the end of, and after."""
+    """Returns the joint error in black frames, and the mean standard deviation before, at the end and after."""
     begin, steps, rows = blackouts(out["valid"].sum((1, 2))), out.shape[1] - 1, torch.arange(len(out))
     at = rows.unsqueeze(-1), (begin.unsqueeze(-1) + torch.arange(BLACK)).clamp(max=steps)
     error = absolute_errors(out["belief", "mean"][at].flatten(0, 1), out["state"][at].flatten(0, 1), circular)
@@ -94,26 +94,26 @@ def blackout(out: TensorDict, circular: Sequence[int] = ()) -> dict[str, float]:
 
 
 def score_row(out: TensorDict, condition: str, names: Sequence[str], unit: Tensor, circular=()) -> dict:
-    """A row of one condition."""
+    """Returns a row of one condition."""
     row = {"condition": condition, **scores(out, names, unit, circular), "episodes": len(out)}
     return row | (blackout(out, circular) if condition == "black20" else {})
 
 
 def filter_rows(recipe: ArmRecipe, model: Filter, readings: dict[str, TensorDict], row: Callable[..., dict]) -> list:
-    """Rows of a filter in all conditions; ``row`` maps a belief and the condition's name to one."""
+    """Returns rows of a filter in all conditions; ``row`` maps a belief and the condition's name to one."""
     costs = cost_of(recipe, model, readings["clean"])
     outs = run_filter(recipe, model, torch.cat(list(readings.values()))).split(len(readings["clean"]))
     return [{**row(out, condition), **costs} for condition, out in zip(readings, outs, strict=True)]
 
 
 def cost_of(recipe: ArmRecipe, model: Filter, readings: TensorDict) -> dict[str, float]:
-    """Parameters behind the sensor, and milliseconds a step of one sequence there."""
+    """Returns the number of parameters without the sensor, and milliseconds per step of one sequence without it."""
     row = readings[:1, :TIMED]
     return cost(model, lambda: run_filter(recipe, model, row), row.shape[1])
 
 
 def save_beliefs(recipe: ArmRecipe, model: Filter, readings: dict[str, TensorDict], name: str, folder: Path) -> None:
-    """Leaves beliefs of the first test sequences for the pictures: ``NAME-CONDITION-NUMBER.pt``."""
+    """Saves beliefs of the first test sequences for the plots: ``NAME-CONDITION-NUMBER.pt``."""
     for condition in ("clean", "black20"):
         for number, out in enumerate(run_filter(recipe, model, readings[condition][:PICTURED])):
             out = out[: int(out["valid"].sum())]
@@ -127,7 +127,7 @@ def save_beliefs(recipe: ArmRecipe, model: Filter, readings: dict[str, TensorDic
 def filter_stage(
     recipe: ArmRecipe, model: Filter, windows: Windows, validation: TensorDict, updates: int, batch: int, lr: float
 ) -> Stage:
-    """A filter's training on windows of readings, validated on whole sequences by their CRPS."""
+    """Returns a filter's training on windows of readings, validated on whole sequences by their CRPS."""
     return Stage(
         "filter",
         recipe.loss(recipe.behind(model, training=True)),
@@ -139,7 +139,7 @@ def filter_stage(
 
 
 def filter_error(recipe: ArmRecipe, model: Filter, readings: TensorDict) -> dict[str, float]:
-    """CRPS of the belief in the units of the loss."""
+    """Returns the CRPS of the belief in the units of the loss."""
     mean, var, truth = counted(run_filter(recipe, model, readings))
     return {"crps": float((crps_gaussian(mean, var, truth) / recipe.unit).mean())}
 
@@ -154,7 +154,7 @@ def fit(
     every: int,
     **settings,
 ) -> Filter:
-    """Trains a filter, or goes on; then its inflation is chosen for the coverage. ``every`` updates are validated."""
+    """Trains a filter, or resumes, then chooses its inflation by coverage; validates after ``every`` updates."""
     fit_filter(
         recipe,
         model,

@@ -1,4 +1,4 @@
-"""Camera sensors of arms: statistics of what they see, how one is built, and its training on single frames."""
+"""Camera sensors of arms: statistics of their data, their construction, and their training on single frames."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ class Frames(Protocol):
     """Single frames in memory."""
 
     def __len__(self) -> int:
-        """N."""
+        """Returns N."""
 
     def rows(self, index: Tensor) -> TensorDict:
-        """Frames with float pixels, and what a loss compares."""
+        """Returns frames with float pixels, and the entries that a loss compares."""
 
 
 @dataclass
 class Statistics:
     """Means and standard deviations of the training sequences alone."""
 
-    loc: Tensor  # of what is read, [D]
-    scale: Tensor
-    rate: Tensor  # root mean square of a joint's change in a row, [7] rad
-    acceleration: Tensor  # of the change's change
-    jerk: Tensor  # of that one's change
+    loc: Tensor  # mean of the components that the sensor reads, [D]
+    scale: Tensor  # their standard deviation
+    rate: Tensor  # root mean square of the first difference of each joint, [7] rad
+    acceleration: Tensor  # of the second difference
+    jerk: Tensor  # of the third difference
     pixel_loc: Tensor
     pixel_scale: Tensor
-    size: tuple[int, int]  # of the pictures, (height, width)
+    size: tuple[int, int]  # of the images, (height, width)
 
     @classmethod
     def of(cls, sequences: Sequence[Tensor], pixels: Tensor) -> Statistics:
-        """Takes statistics of true numbers ``[T, D]`` of sequences, and of pictures, uint8."""
+        """Returns the statistics of sequences of true values ``[T, D]``, and of images, uint8."""
         flat, some = torch.cat(list(sequences)), pixels[:: max(len(pixels) // 500, 1)].float() / 255
         rates = [
             torch.cat([one[:, :JOINTS].diff(dim=0, n=order) for one in sequences]).square().mean(0).sqrt()
@@ -54,7 +54,7 @@ class Statistics:
 
 
 def camera_sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor, scale: Tensor, **head) -> ImageSensor:
-    """A sensor of numbers with a mean and a standard deviation each."""
+    """Returns a sensor whose outputs are normalised by ``loc`` and ``scale``."""
     return ImageSensor(
         len(loc),
         image_shape=(3, *facts.size),
@@ -71,7 +71,7 @@ def camera_sensor(facts: Statistics, trunk: nn.Module, samples: int, loc: Tensor
 
 @torch.no_grad()
 def clean_loss(sensor: ImageSensor, loss: nn.Module, held_out: Frames) -> float:
-    """The loss of frames as they are, from the same random numbers each time."""
+    """Returns the loss of frames without augmentation, with the same seed in each call."""
     training, values = sensor.training, []
     sensor.eval()
     with torch.random.fork_rng(devices=[]):
@@ -94,18 +94,18 @@ def train_sensor(
     lr: float,
     weight_decay: float,
 ) -> ImageSensor:
-    """Trains a sensor, or goes on where that was broken off, or reads it where it was done.
+    """Trains a sensor, resumes its training, or loads it if it was trained before.
 
     Args:
         sensor: trained in place.
         loss: maps frames to terms.
         sample: draws training frames.
-        held_out: frames to choose by.
-        out: checkpoints and logs.
+        held_out: validation frames.
+        out: folder for checkpoints and logs.
         seed: of all random numbers.
-        updates: how many.
+        updates: number of updates.
         lr: learning rate.
-        weight_decay: likewise.
+        weight_decay: of the optimiser.
     """
     stage = Stage("sensor", loss, lambda generator, _: sample(generator), updates, lr=lr, weight_decay=weight_decay)
     return train_part(

@@ -1,4 +1,4 @@
-"""Filters by name. One of your own: a :class:`KITTIRecipe` with ``@register``, in a file in this folder."""
+"""Filters by name. To add a filter, decorate a :class:`KITTIRecipe` with ``@register`` in a file in this folder."""
 
 from benchmarks.kitti.recipes._base import FILTERS, REACH, KITTIRecipe, register
 

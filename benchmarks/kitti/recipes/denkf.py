@@ -17,11 +17,11 @@ from torch_denkf.modules import AroundState, EnsembleAnalysis, StochasticMLP
 
 @register
 class DEnKF(KITTIRecipe):
-    """The differentiable ensemble Kalman filter: innovations correct the velocities, each member's pose follows.
+    """The differentiable ensemble Kalman filter: innovations correct the velocities, from which the poses follow.
 
     Attributes:
         size: members; the sensor has as many samples.
-        lags: past steps that an innovation may still correct.
+        lags: past steps that an innovation also corrects.
     """
 
     size, lags = SAMPLES, 4
@@ -33,7 +33,7 @@ class DEnKF(KITTIRecipe):
             # Flipout perturbs the last layer's bias, too: process noise that does not depend on the velocity.
             transition=self.transition(StochasticMLP(2, 2, layer="flipout", output_gain=0.1)),
             observation=self.observation(),
-            # Most of the sensor's error stays for a whole drive: each member predicts by its own calibration.
+            # Most of the sensor's error is constant over a drive: each member has a calibration of its own.
             gain=MemberGain([0.05, 0.02], ensemble_size=self.size, in_key=("forecast", "observation")),
             analysis=TensorDictSequential(analysis, UnicycleMotion(self.facts.dt, history_key=HISTORY, smooth=True)),
         )

@@ -22,10 +22,10 @@ from torch_denkf.modules import (
 
 
 class _Gaussian(KITTIRecipe):
-    """Known motion of the pose; its correlation with the velocities carries the corrections.
+    """Base of filters with known motion of the pose, which is corrected by its correlation with the velocities.
 
-    Inflation goes into Q and R, so that the gain stays as it was trained. The analysis' own inflation would multiply
-    the pose's variance in every step, too, which nothing observes: it would grow without bound.
+    Inflation multiplies Q and R, so that the gain stays as trained. The analysis' own inflation would also multiply the
+    variance of the unobserved pose in every step, without bound.
     """
 
     def modules(self):
@@ -38,7 +38,7 @@ class _Gaussian(KITTIRecipe):
         )
 
     def process_noise(self) -> SubModel:
-        """Q of (v, theta_dot), from their mean; the rest of the state must not count, so its scale is infinite."""
+        """Returns Q of (v, theta_dot) from their mean; an infinite scale removes the rest of the state."""
         size = 5 + 2 * (LONGEST - 1)
         loc, scale = torch.zeros(size), torch.full((size,), torch.inf)
         loc[3:5], scale[3:5] = self.facts.loc, self.facts.scale

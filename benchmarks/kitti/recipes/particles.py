@@ -25,7 +25,7 @@ class DPF_M_LRN(Particles, KITTIRecipe):
             2,
             r=self.unit,
             in_features=5,
-            # Of the mean velocities alone: an infinite scale hides the pose.
+            # A function of the mean velocities alone: an infinite scale removes the pose.
             loc=torch.cat([torch.zeros(3), facts.loc]),
             scale=torch.cat([torch.full((3,), torch.inf), facts.scale]),
             in_key=("belief", "mean"),

@@ -1,1 +1,1 @@
-"""Runs that last: a module for each part, with a function ``jobs``: what makes each row of its table, by name."""
+"""Long runs: a module for each part, with functions that return the jobs for the rows of its table by name."""

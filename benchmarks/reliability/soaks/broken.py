@@ -1,6 +1,7 @@
-"""Work that is broken off: by kills at random moments, by disks that are full or read-only, by a second process.
+"""Jobs that are interrupted: by kills at random moments, by full or read-only disks, by a second process.
 
-Each work writes to a folder. Started again, it is to end as if nothing had happened, and to leave nothing half written.
+Each job writes to a folder. When run again, it must end with the result of an uninterrupted run, and without incomplete
+files.
 """
 
 from __future__ import annotations
@@ -23,9 +24,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from benchmarks.reliability.borders.recorded import V2, made, own, read_demos, read_drive, read_episodes, read_own
 from benchmarks.reliability.case import Case, apart, forked, judge
 from tests.applications.ur5.data.ur5_demos import make_demo, write_folder
+from tests.borders import kitti, ur5
+from tests.borders.folders import made
+from tests.borders.lerobot import V2, read_episodes
+from tests.borders.recordings import own, read_own
 from tests.filters.factories import linear_denkf
 from tests.training.problem import make_trainer
 from torch_denkf.applications.car import with_motion
@@ -37,20 +41,20 @@ from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 SMALL, LARGE = "size=64k", "size=400m"
 LEFT = re.compile(r"^\.(writing|demo|collection|.*\.part)|\.part$|\.tmp$|-[0-9a-f]{8}$")
-GRACE = 90.0  # s in which workers of a killed process end themselves: they may be importing torch
+GRACE = 90.0  # s in which workers of a killed process must end: they may be importing torch
 PICTURE = (100, 300)
 
 
 @dataclass(frozen=True)
 class Work:
-    """Something that writes to a folder.
+    """A job that writes to a folder.
 
     Args:
-        do: does it, or goes on with it.
-        result: all that it leaves.
-        words: one of them is in the message where it cannot write; none where disks are not tried.
-        killed: whether it is killed, too.
-        alone: whether a second process may raise; ``None`` where that is not tried.
+        do: runs or resumes it.
+        result: reads its results.
+        words: the message of a failed write must have one of them; empty to skip the tests with disks.
+        killed: whether to test kills.
+        alone: whether a second process may raise; ``None`` to skip that test.
     """
 
     do: Callable[[Path], Any]
@@ -69,7 +73,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def equal(one: Any, other: Any) -> bool:
-    """Tells whether tensors, files and plain values are the same."""
+    """Returns whether tensors, files and plain values are equal."""
     if isinstance(one, torch.Tensor):
         return one.dtype == other.dtype and torch.equal(one, other)
     if isinstance(one, TensorDict):
@@ -82,7 +86,7 @@ def equal(one: Any, other: Any) -> bool:
 
 
 def read(reader: Callable[[Path], Any], words: tuple[str, ...] = ("cache",), **tried: Any) -> Work:
-    """Work whose result is read from what it leaves, in the same way."""
+    """Returns a job that reads through a cache, and whose result is that of reading again."""
     return Work(reader, reader, words, **tried)
 
 
@@ -98,11 +102,11 @@ large_demos = made(
 
 
 def _drive(folder: Path) -> TensorDict:
-    return read_drive(large_drive(), "a", size=PICTURE, cache=folder)
+    return kitti.read_drive(large_drive(), "a", size=PICTURE, cache=folder)
 
 
 def _motion(folder: Path) -> TensorDict:
-    return with_motion(read_drive(large_drive(), "a", size=PICTURE), cache=folder, keep_images=False)
+    return with_motion(kitti.read_drive(large_drive(), "a", size=PICTURE), cache=folder, keep_images=False)
 
 
 def _checkpoint(folder: Path) -> Any:
@@ -124,7 +128,7 @@ def _render(folder: Path, processes: int = 1) -> None:
 
 
 def _export(folder: Path, compiled: bool = False) -> None:
-    with tempfile.TemporaryDirectory() as cache:  # of what inductor compiles
+    with tempfile.TemporaryDirectory() as cache:  # of inductor
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache
         frame = TensorDict({"observation": torch.zeros(2)})
         export_step(linear_denkf("etkf"), frame, folder / "step.pt2", compiled=compiled)
@@ -145,7 +149,7 @@ _train = lambda folder: make_trainer(folder / "run", updates=12, progress=False)
 WORKS: dict[str, Work] = {
     "cache of a drive": read(_drive, killed=True, alone=False),
     "cache of a drive's motion": read(_motion),
-    "cache of demos": read(lambda folder: read_demos(large_demos(), cache=folder), killed=True),
+    "cache of demos": read(lambda folder: ur5.read_demos(large_demos(), cache=folder), killed=True),
     "cache of a LeRobot recording": read(lambda folder: read_episodes(V2.sound(), size=(200, 300), cache=folder)),
     "cache of pictures": read(
         lambda folder: read_own(own(), camera="images", replay={"cache": folder, "size": (300, 300)})
@@ -163,7 +167,7 @@ WORKS: dict[str, Work] = {
 
 
 def workers(session: int) -> list[int]:
-    """Returns the processes of a session that are still there."""
+    """Returns the running processes of a session."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
@@ -173,13 +177,13 @@ def workers(session: int) -> list[int]:
 
 
 def left_behind(folder: Path) -> list[str]:
-    """Returns files and folders of writes that did not end."""
+    """Returns files and folders of incomplete writes."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if LEFT.search(path.name))
 
 
 @contextmanager
 def two_folders() -> Iterator[tuple[Path, Path, Path]]:
-    """One folder for work that is broken off, one for work that is not, and a file for what is said."""
+    """Yields a folder for the interrupted job, one for the uninterrupted job, and a log file."""
     with tempfile.TemporaryDirectory(prefix="broken-", ignore_cleanup_errors=True) as root:
         broken, sound = Path(root, "broken"), Path(root, "sound")
         broken.mkdir()
@@ -188,7 +192,7 @@ def two_folders() -> Iterator[tuple[Path, Path, Path]]:
 
 
 def ends_equal(work: Work, broken: Path, sound: Path, *again: Path) -> str:
-    """Does the work in some folders, and returns the verdict on what it left in two."""
+    """Runs the job again in some folders, and returns the verdict on the equality of both results."""
 
     def alike(folder: Path) -> bool:
         for place in again:
@@ -199,7 +203,7 @@ def ends_equal(work: Work, broken: Path, sound: Path, *again: Path) -> str:
 
 
 def killed(name: str, kills: int, seed: int) -> dict[str, Any]:
-    """Kills work at random moments, and starts it again."""
+    """Kills a job at random moments, and runs it again."""
     work, chance, count, lingering = WORKS[name], random.Random(f"{name} {seed}"), 0, 0
     with two_folders() as (broken, sound, log):
         began = time.monotonic()
@@ -209,7 +213,7 @@ def killed(name: str, kills: int, seed: int) -> dict[str, Any]:
             child = forked(lambda: work.do(broken), log)
             time.sleep(chance.uniform(0.02, 0.95) * usual / (1 + count % 3))
             done, status = os.waitpid(child, os.WNOHANG)
-            if done:  # it came to its end: once more from the start
+            if done:  # it finished before the kill: start over in an empty folder
                 if status:
                     raise RuntimeError(f"the work failed after {count} kills: {log.read_text()[-2000:]}")
                 subprocess.run(["find", broken, "-mindepth", "1", "-delete"], check=True)
@@ -234,7 +238,7 @@ def killed(name: str, kills: int, seed: int) -> dict[str, Any]:
 
 @contextmanager
 def disk(options: str) -> Iterator[Path]:
-    """A small file system in memory."""
+    """Mounts a small file system in memory."""
     folder = Path(tempfile.mkdtemp(prefix="disk-"))
     subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], check=True)
     try:
@@ -245,7 +249,7 @@ def disk(options: str) -> Iterator[Path]:
 
 
 def on_disk(name: str, full: bool) -> dict[str, Any]:
-    """Writes where there is no room, or nothing may be written; and again where there is."""
+    """Runs a job on a full or read-only disk, and again after the disk has room."""
     work = WORKS[name]
     with disk(SMALL if full else LARGE) as broken, two_folders() as (_, sound, _):
         if not full:
@@ -265,7 +269,7 @@ def on_disk(name: str, full: bool) -> dict[str, Any]:
 
 
 def two(name: str) -> dict[str, Any]:
-    """Two processes do the same in one folder at a time."""
+    """Runs the same job in two processes in one folder."""
     work = WORKS[name]
     with two_folders() as (broken, sound, log):
         logs = [log.with_suffix(f".{k}") for k in range(2)]
@@ -287,16 +291,16 @@ Rows = dict[str, Callable[[], dict[str, Any]]]
 
 
 def kill_jobs(kills: int, seed: int) -> Rows:
-    """So many kills of each work, at moments of a seed."""
-    large_drive(), large_demos()  # here, not in each work's process
+    """Returns jobs that kill each work ``kills`` times, at moments from a seed."""
+    large_drive(), large_demos()  # once here, not in each job's process
     return {name: partial(killed, name, kills, seed) for name, work in WORKS.items() if work.killed}
 
 
 def disk_jobs() -> Rows:
-    """Each work on each kind of disk, and in two processes; what they start from is made here.
+    """Returns jobs that run each work on each kind of disk, and in two processes.
 
     Raises:
-        PermissionError: where one may not mount file systems.
+        PermissionError: without the permission to mount file systems.
     """
     if os.geteuid() != 0:
         raise PermissionError("small disks are mounted, which needs root; leave out the part 'disks'")

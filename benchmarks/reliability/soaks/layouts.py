@@ -1,11 +1,11 @@
-"""A filter inside collectors and worker processes, every step of it compared with the same step taken by hand.
+"""A filter inside collectors and worker processes, with every step compared to the same step by hand.
 
-The filter draws nothing at random, so that what an environment returns follows from what it was given: the belief of
-t+1 from that of t, the action and the frame; the belief after a reset is known; and what is handed on from step to
-step, and from batch to batch, must be what came out before.
+The filter is deterministic, so that an environment's outputs follow from its inputs: the belief at t+1 from that at t,
+the action and the frame; the belief after a reset is known; and the inputs of each step and batch must be the outputs
+of the one before.
 
 Each process's environment has several rows, so that one exchange between processes moves steps of all of them. Steps
-are counted of each row: 64 rows that step once are 64 steps, and one exchange.
+are counted per row: 64 rows that step once are 64 steps, and one exchange.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ CLOSE = 1e-4  # float32, another order of sums
 
 
 def plain(seed: int = 0) -> EnvBase:
-    """Rows without a filter; half of their readings are missing."""
+    """Returns rows without a filter; half of their readings are missing."""
     return base_env(seed=seed, missing=0.5, max_steps=LENGTHS, batch_size=[ROWS])
 
 
 def filtered(base: EnvBase | None = None, *, seed: int = 0) -> EnvBase:
-    """An environment with the filter in it."""
+    """Returns an environment with the filter in it."""
     base = plain(seed) if base is None else base
     return TransformedEnv(TransformedEnv(base, DEnKFTransform(linear_denkf("etkf"))), InitTracker())
 
@@ -99,7 +99,7 @@ class Reference:
     def __init__(self):
         self.filter = linear_denkf("etkf")
         self.start = self.filter.initial.members
-        self.ends: list[TensorDictBase] = []  # of the last batch; of each worker's, where they come in any order
+        self.ends: list[TensorDictBase] = []  # last rows of the last batch, of each worker if the order is arbitrary
         self.worst = {"step": 0.0, "reset": 0.0, "handed on": 0.0}
         self.frames = self.resets = self.missing = 0
 
@@ -137,7 +137,7 @@ class Reference:
 
 
 def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
-    """Tells whether a batch goes on where another ended: in the same episodes, which collectors number."""
+    """Returns whether a batch continues the episodes of another, by the collectors' episode numbers."""
     episodes = [each.get(("collector", "traj_ids"), None) for each in (end, start)]
     if any(episode is None for episode in episodes):
         return True
@@ -146,7 +146,7 @@ def _goes_on(end: TensorDictBase, start: TensorDictBase) -> bool:
 
 
 def soak(name: str, steps: int) -> dict[str, Any]:
-    """A row of the table: a layout, for so many steps of all its environments together."""
+    """Returns a row of the table: a layout, for ``steps`` steps over all its environments."""
     torch.manual_seed(0)
     reference = Reference()
     for batch in LAYOUTS[name](steps):
@@ -163,5 +163,5 @@ def soak(name: str, steps: int) -> dict[str, Any]:
 
 
 def jobs(steps: int) -> dict[str, Callable[[], dict[str, Any]]]:
-    """So many steps in each layout."""
+    """Returns jobs that run ``steps`` steps in each layout."""
     return {name: partial(soak, name, steps) for name in LAYOUTS}

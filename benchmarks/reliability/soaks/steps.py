@@ -1,4 +1,4 @@
-"""A million steps of every filter's packaged step, with long stretches in which nothing is observed."""
+"""A million steps of every filter's packaged step, with long stretches of missing observations."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from torch_denkf.modules import GaussianPrior
 
 EVERY, STRETCH = 100_000, 10_000  # steps from one stretch without readings to the next, and its length
 CHUNK = 10_000
-SETTLE = 2_000  # steps after which a start is forgotten
-COMPARED = 100  # steps without readings, and as many with them, that the filter itself takes, too
+SETTLE = 2_000  # steps after which the initial belief has no influence
+COMPARED = 100  # steps without readings, and as many with them, that are compared with the filter itself
 
 
 def _ensemble(scheme: str) -> Filter:
     return linear_denkf(scheme, noisy=True, initial=GaussianPrior([0.0, 0.0], [1.0, 1.0], ensemble_size=32))
 
 
-#: Filters that draw nothing at random, and others.
+#: Deterministic filters; those with random draws follow.
 EXACT: dict[str, Callable[[], Filter]] = {
     "KalmanFilter": linear_kalman,
     **{name: partial(linear_filter, name) for name in ("EKF", "UKF", "BackpropKF")},
@@ -47,7 +47,7 @@ SAMPLED: dict[str, Callable[[], Filter]] = {
 
 
 def drawn(number: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """States, readings, and whether they arrive, NaN where not, of a chunk, which follow from its number alone."""
+    """Returns states, readings (NaN for missing ones) and observed masks of a chunk, seeded by its number."""
     F, Q, H, R = linear_system()
     random = torch.Generator().manual_seed(number)
     state, states = torch.zeros(2), []
@@ -61,19 +61,19 @@ def drawn(number: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def memory() -> int:
-    """The process's resident memory, bytes."""
+    """Returns the process's resident memory, bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 class Run:
-    """Steps of a package, from the filter's prior on."""
+    """Runs a packaged step from the filter's prior."""
 
     def __init__(self, step: PackagedStep, filter: Filter):
         begun = filter.initialise(TensorDict({"observation": torch.zeros(2)}))
         self.step, self.carry = step, {name: begun[tuple(name.split("."))].clone() for name in step.carry}
 
     def chunk(self, readings: torch.Tensor, observed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Means and variances, ``[CHUNK, 2]``."""
+        """Returns means and variances, ``[CHUNK, 2]``."""
         found = []
         for reading, seen in zip(readings.unbind(0), observed.unbind(0), strict=True):
             out = self.step({**self.carry, "observation": reading, "observed": seen})
@@ -84,7 +84,7 @@ class Run:
 
 
 def differs(step: PackagedStep, filter: Filter, readings: torch.Tensor, observed: torch.Tensor) -> float:
-    """Largest difference of a package's means and variances from those of the filter itself, step by step."""
+    """Returns the largest difference of means and variances between a packaged step and the filter's own."""
     row, off = filter.initialise(TensorDict({"observation": torch.zeros(2)})), 0.0
     for reading, seen in zip(readings.unbind(0), observed.unbind(0), strict=True):
         row["observation"], row["observed"] = reading, seen
@@ -95,7 +95,7 @@ def differs(step: PackagedStep, filter: Filter, readings: torch.Tensor, observed
 
 
 def soak(name: str, steps: int) -> dict[str, Any]:
-    """A row of the table."""
+    """Returns a row of the table."""
     make, exact = (EXACT | SAMPLED)[name], name in EXACT
     torch.manual_seed(0)
     filter, chunks = make(), steps // CHUNK
@@ -138,5 +138,5 @@ def soak(name: str, steps: int) -> dict[str, Any]:
 
 
 def jobs(steps: int) -> dict[str, Callable[[], dict[str, Any]]]:
-    """So many steps of each filter."""
+    """Returns jobs that run ``steps`` steps of each filter."""
     return {name: partial(soak, name, steps) for name in EXACT | SAMPLED}

@@ -29,7 +29,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def training(root, tmp_path_factory):
-    """The folder of a training, and what the command said."""
+    """Returns the folder of a training, and what the command said."""
     folder, said = tmp_path_factory.mktemp("car"), io.StringIO()
     with contextlib.redirect_stdout(said):
         assert main(["train", "--root", str(root), "--out", str(folder), *WORDS.split()]) == 0
@@ -38,13 +38,13 @@ def training(root, tmp_path_factory):
 
 @pytest.fixture
 def trained(training):
-    """The folder of the training, and its filter."""
+    """Returns the folder of the training, and its filter."""
     return training[0], from_pretrained(training[0])
 
 
 @pytest.fixture
 def checkpoint(training, tmp_path):
-    """A copy of the filter's folder, without what the training needs."""
+    """Returns a copy of the filter's folder, without what the training needs."""
     for name in ("config.json", "weights.safetensors"):
         shutil.copy(training[0] / name, tmp_path / name)
     return tmp_path

@@ -8,11 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from tests.applications.car.vision.drives_for_tests import rendered
-from torch_denkf.applications.car import (
-    KITTIReplayEnv,
-    OpticalFlow,
-    with_motion,
-)
+from torch_denkf.applications.car import KITTIReplayEnv, OpticalFlow, with_motion
 from torch_denkf.applications.car.kitti.frames import frames_at
 from torch_denkf.applications.car.vision.motion import image_motion
 
@@ -35,7 +31,7 @@ def flow_env(drive, **kwargs):
 
 
 def same(out, expected, keys=("flow", "road")):
-    """Keeps the numbers but for half precision, in which a drive's motion is kept."""
+    """Keeps the numbers except for half precision, in which a drive's motion is kept."""
     for key in keys:
         assert out[key].dtype == torch.float32
         assert out[key].half().equal(expected[key]), key

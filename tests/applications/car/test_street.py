@@ -54,7 +54,7 @@ def project(camera, pose, points):
 
 
 def project_disc(camera, pose, x, z, height, radius):
-    """The middle of a disc's picture, which is not the picture of its middle: near parts appear larger."""
+    """Returns the middle of a disc's picture, which is not the picture of its middle: near parts appear larger."""
     ring = np.sqrt((np.arange(200) + 0.5) / 200) * radius
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(200)
     px, pz = x + ring * np.cos(angle), z + ring * np.sin(angle)
@@ -63,7 +63,7 @@ def project_disc(camera, pose, x, z, height, radius):
 
 
 def empty(poses, **changes):
-    """A scene along poses with nothing on the ground."""
+    """Returns a scene along poses with nothing on the ground."""
     scene = roadside_scene(poses_to_state(poses, KITTI_DT), np.random.default_rng(0), ground=poses[:, 1, 3] + HEIGHT)
     bare = {"objects": [], "dashes": np.zeros((0, 2, 2)), "blots": np.zeros((0, 5)), "light": np.ones(3)}
     return dataclasses.replace(scene, **bare, sun=np.zeros(2), shade=1.0, gamma=1.0, **changes)

@@ -27,7 +27,7 @@ def log_of(request, tmp_path):
     return file, truth
 
 
-def test_it_writes_orientations_and_a_picture(log, tmp_path, capsys):
+def test_command_writes_orientations_and_a_picture(log, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     file, truth = log
     assert main(["orient", "--log", str(file), "--out", str(tmp_path / "out")]) == 0
@@ -42,7 +42,7 @@ def test_it_writes_orientations_and_a_picture(log, tmp_path, capsys):
     assert (tmp_path / "out" / "orientation.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_logs_that_are_none(tmp_path, capsys):
+def test_invalid_logs_raise(tmp_path, capsys):
     np.savez(tmp_path / "a.npz", gyro=np.zeros((9, 3)))
     assert main(["orient", "--log", str(tmp_path / "a.npz"), "--out", str(tmp_path / "out")]) == 2
     assert "lacks ['acceleration', 'rate']" in capsys.readouterr().err
@@ -51,7 +51,7 @@ def test_logs_that_are_none(tmp_path, capsys):
         read_log(tmp_path / "b.csv")
 
 
-#: Rows and columns of the table t, gx, gy, gz, ax, ay, az, mx, my, mz, and what they become.
+#: Rows and columns of the table t, gx, gy, gz, ax, ay, az, mx, my, mz, and their damaged values.
 DAMAGES = {
     "acceleration in g": ([np.s_[:, 4:7]], lambda part: part / 9.81, "acceleration is in m/s^2"),
     "degrees a second": ([np.s_[:, 1:4]], np.rad2deg, "multiply them by pi / 180"),
@@ -93,7 +93,7 @@ def test_damaged_logs_raise_or_are_right(what, tmp_path, capsys):
 
 @pytest.mark.parametrize("log", ["csv"], indirect=True)
 def test_later_readings_count(log, tmp_path):
-    """In the middle of a log the smoothed heading is known better, at its end as well."""
+    """The smoothed heading has a smaller variance in the middle of a log, and the same at its end."""
     pytest.importorskip("matplotlib")
     stds = []
     for number, more in enumerate(([], ["--smooth"])):

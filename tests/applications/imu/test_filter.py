@@ -25,7 +25,7 @@ SETTINGS = ImuSettings(
 
 
 def body_log(count=400, rate=100.0, seed=0):
-    """A body that rests for 2 s and then turns and sways; gyro with a bias, white noise on all."""
+    """Returns a body that rests for 2 s and then turns and sways; gyro with a bias, white noise on all."""
     generator = torch.Generator().manual_seed(seed)
     time = torch.arange(count, dtype=torch.float64).unsqueeze(-1) / rate
     moving = time >= 2.0
@@ -72,7 +72,7 @@ def left_jacobian(v):
 
 
 def reference(rows, s):
-    """An error-state Kalman filter; the rotation's error stands in the world's axes, vectors in the body's."""
+    """Returns an error-state Kalman filter; the rotation's error stands in the world's axes, vectors in the body's."""
     start = np.array([s.tilt] * 2 + [s.heading] + [s.gyro_bias] * 3)
     errors = [s.gyro_scale if i == j else s.gyro_skew for i in range(3) for j in range(3)]
     rest = [s.motion_start] * 9 + [s.magnetic_bias] * 3 + [s.field] * 2 + [s.lag_std] + [s.stray] * 3 + [s.lever] * 3
@@ -131,7 +131,7 @@ def reference(rows, s):
 
 @torch.no_grad()
 @pytest.mark.parametrize("axes", [9, 6])
-def test_it_is_the_error_state_kalman_filter(axes):
+def test_equals_the_error_state_kalman_filter(axes):
     _, log = body_log()
     if axes == 6:
         del log["magnetometer"]
@@ -198,7 +198,7 @@ def test_a_log_that_is_not_one():
 
 
 @pytest.mark.slow
-def test_compiled_it_believes_the_same():
+def test_compiled_equals_eager():
     """The first compiled step is compared with the eager one, and raises if it differs."""
     _, log = body_log(100)
     model = from_pretrained("imu").double()

@@ -26,7 +26,7 @@ def log():
 
 
 def test_the_sensors_read_how_their_place_moves():
-    """Its place is beside the base's origin, turned. With the simulator's own steps: contacts are short."""
+    """Its place is next to the base's origin, turned. With the simulator's own steps: contacts are short."""
     env = LeggedEnv(quadruped_env().model, **QUADRUPED, dt=0.0025, errors=PERFECT)
     log = trotting(env, 800).double()
     sensor = LegKinematics(env.model, QUADRUPED["feet"], QUADRUPED["imu"]).base.double()
@@ -43,7 +43,7 @@ def test_the_sensors_read_how_their_place_moves():
     assert (change - world[2:]).square().mean().sqrt() < 0.03 * change.square().mean().sqrt()
 
 
-def test_feet_that_stand_press_the_floor_and_carry_the_robot(log):
+def test_contact_forces_carry_the_robot(log):
     weight = quadruped_env().model.body_mass.sum() * 9.81
     assert log["force"].sum(-1).mean() == pytest.approx(weight, rel=0.1)
     assert ((log["force"] > 150) <= log["contact"]).all()

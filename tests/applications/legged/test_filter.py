@@ -71,7 +71,7 @@ def test_a_start_without_acceleration_is_level(kind):
 
 
 @pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
-def test_a_run_goes_on_from_what_is_carried(kind):
+def test_run_resumes_from_the_carry(kind):
     """The velocity of the stored belief follows from it and from what the gyro reads then."""
     env = quadruped_env(seed=1)
     log = trotting(env, 12).select("imu", "joints", "joint_rates", "contact").unsqueeze(0)

@@ -1,4 +1,4 @@
-"""The humanoid in its harness: it walks on its own legs, goes where the harness goes, and a filter follows it."""
+"""A legged filter estimates the velocity of the simulated humanoid, which walks in a harness."""
 
 import torch
 
@@ -16,7 +16,7 @@ def walking(env, steps, **gait):
     return torch.stack(rows)
 
 
-def test_a_filter_follows_it():
+def test_velocity_error_of_the_humanoid():
     env = humanoid_env(seed=1)
     log = walking(env, 200).unsqueeze(0)
     filter = legged_filter(env.model, **HUMANOID, dt=env.dt, kind="EKF")

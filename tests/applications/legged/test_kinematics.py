@@ -43,7 +43,7 @@ def model_of(name):
 
 
 def of_mujoco(model, data, feet, imu):
-    """Positions of the feet in the sensor's axes."""
+    """Returns positions of the feet in the sensor's axes."""
 
     def frame(name):
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) >= 0:
@@ -82,7 +82,7 @@ def test_joints_come_in_the_order_that_is_named(float64):
     assert torch.equal(plain.velocities(angles, angles), other.velocities(turned, turned))
 
 
-def test_what_is_not_there_is_said():
+def test_missing_names_raise():
     model, feet, imu = model_of("odd")
     with pytest.raises(KeyError, match=r"no site or body 'toe'. Its sites: \['imu', 'left'\]"):
         LegKinematics(model, ["toe"], imu)

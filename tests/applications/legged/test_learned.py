@@ -53,7 +53,7 @@ def test_each_foot_has_a_covariance_of_its_own(model, log):
     assert (blocks[..., 0, :, 0, :] - blocks[..., 0, :, 0, :].mT).abs().max() < 1e-7
 
 
-def test_feet_of_a_rigid_turn_say_one_velocity(model, log):
+def test_feet_of_a_rigid_rotation_give_one_velocity(model, log):
     """With true joints and no foot that slides each foot says the base's velocity: here that is made up."""
     contacts, kinematics = contacts_of(model, rows=1), contacts_of(model).kinematics
     imu, joints = (log[key][0] for key in ("imu", "joints"))
@@ -82,8 +82,8 @@ def test_a_foot_walks_as_its_noise_says():
 
 
 @pytest.mark.parametrize("kind", ["EKF", "DEnKF"])
-def test_untrained_they_are_the_noises(kind, model, log):
-    """Constant covariances are those of LeggedNoises(slip=, rate=); a foot walks for each step anew."""
+def test_untrained_covariances_equal_legged_noises(kind, model, log):
+    """Constant covariances are those of LeggedNoises(slip=, rate=); slip is independent in each step."""
     rate, slip = LASTS**0.5 * RATE, (0.01 * LASTS) ** 0.5 * RATE
     rows, options = with_last_rows(log, 10), {"dt": 0.01, "kind": kind, "ensemble_size": 16}
     velocities = []
@@ -137,7 +137,7 @@ def test_a_filter_moves_a_foot_that_slides(model):
     assert found[1] > 0.1
 
 
-def test_they_learn_through_the_filter(model, log):
+def test_contacts_are_trained_through_the_filter(model, log):
     contacts = contacts_of(model)
     filter = legged_filter(model, **QUADRUPED, dt=0.01, kind="EKF", contacts=contacts)
     out = filter.sequence(with_last_rows(log[:, :6], 10))
@@ -151,7 +151,7 @@ def test_they_learn_through_the_filter(model, log):
 
 
 @pytest.mark.slow
-def test_the_shipped_filter_knows_feet_that_slide():
+def test_pretrained_filter_handles_sliding_feet():
     """Against contacts that a threshold tells alone, with the noises of its validation, where friction is .2."""
     base = quadruped_env(friction=0.2, seed=7)
     rows = trotting(base, 200).select(*KEYS, "true").unsqueeze(0)

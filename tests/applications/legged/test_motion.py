@@ -20,7 +20,7 @@ def _double(float64):
     return
 
 
-def test_it_is_a_group_and_its_jacobian_that_of_autodiff():
+def test_group_axioms_and_jacobian_equal_autodiff():
     space = LeggedSpace(2)
     torch.manual_seed(0)
     one, other, third = (space.exp(torch.randn(space.tangent_dim)) for _ in range(3))
@@ -90,7 +90,7 @@ class Hartley:
         self.bias, self.feet = mean[10:16].numpy().copy(), mean[16:].reshape(-1, 3).numpy().copy()
 
     def world(self):
-        """Velocity, position, feet, and where their errors stand."""
+        """Returns the velocity, position, feet, and where their errors stand."""
         places = [slice(3, 6), slice(6, 9), *(slice(15 + 3 * k, 18 + 3 * k) for k in range(len(self.feet)))]
         return zip([*self.vectors, *self.feet], places, strict=True)
 
@@ -136,11 +136,11 @@ def cross(vector):
 
 
 def series(matrix, later=0):
-    """The exponential of a matrix, or its integrals."""
+    """Returns the exponential of a matrix, or its integrals."""
     return sum(np.linalg.matrix_power(matrix, k) / math.factorial(k + later) for k in range(12))
 
 
-def test_it_is_the_filter_of_hartley():
+def test_equals_the_filter_of_hartley():
     """Forty rows of a quadruped that stands and bends its legs, from a start that is tilted by ten degrees."""
     env, noises = quadruped_env(seed=0), LeggedNoises(tilt=0.2)
     row, rows = env.reset(), []

@@ -25,7 +25,7 @@ def states(count=5):
     return state
 
 
-def test_it_is_how_the_base_moves_in_its_own_axes():
+def test_velocity_is_in_body_axes():
     """The base's pose by that of its sensor, a moment before and after: central differences."""
     state, gyro, pose = states(), torch.randn(5, 3), sensor()
 
@@ -40,7 +40,7 @@ def test_it_is_how_the_base_moves_in_its_own_axes():
     torch.testing.assert_close(base_velocity(state, gyro, pose), expected, rtol=0, atol=1e-8)
 
 
-def test_its_variance_is_that_of_a_linearisation():
+def test_variance_equals_linearisation():
     """Maps a covariance in which velocity and bias are correlated: a wrong sign of the lever shows in that alone."""
     state, gyro, pose, space = states(), torch.randn(5, 3), sensor(), LeggedSpace(FEET)
     root = torch.randn(5, space.tangent_dim, space.tangent_dim)

@@ -33,7 +33,7 @@ def flags(*places):
 
 
 def drive(seconds=60.0, seed=0):
-    """Times at 20 Hz, places, headings, speeds and turn rates of a car."""
+    """Returns times at 20 Hz, positions, headings, speeds and turn rates of a car."""
     rng, dt = np.random.default_rng(seed), 0.05
     time = np.arange(0, seconds, dt)
     turn, speed = np.zeros(len(time)), np.full(len(time), 5.0)
@@ -46,7 +46,7 @@ def drive(seconds=60.0, seed=0):
 
 
 def write_log(file, seconds=60.0):
-    """A wide log as a phone writes it: degrees, km/h, fixes once a second that are repeated until the next one."""
+    """Writes a wide log of a phone: degrees, km/h, and GPS fixes at 1 Hz that are repeated in between."""
     rng = np.random.default_rng(1)
     time, place, _, speed, turn = drive(seconds)
     fixes = place + 0.3 * rng.normal(size=place.shape)
@@ -109,7 +109,7 @@ def test_a_state_that_the_log_lacks(tmp_path):
 
 
 def planar(folder, seconds, **more):
-    """A log of fixes and a gyro, and the model that reads them."""
+    """Returns a log of fixes and a gyro, and the model that reads them."""
     write_log(folder / "log.csv", seconds)
     settings = {"two_d_mode": True, "frequency": 2.0, "initial_estimate_covariance": [1.0] * 15}
     settings |= {"pose0": "gps", "pose0_config": flags(0, 1), "imu0": "imu", "imu0_config": flags(11)}
@@ -134,7 +134,7 @@ def test_noises_that_are_learned_are_those_of_the_log(tmp_path):
         learn_noises(model, rows[:5], steps=1, shown=False)
 
 
-def test_what_was_learned_is_kept_when_it_is_interrupted(tmp_path, monkeypatch):
+def test_interrupted_learning_keeps_its_result(tmp_path, monkeypatch):
     log, model = planar(tmp_path, 20.0)
     rows, calls = rows_of_log(log, model), []
 
@@ -180,7 +180,7 @@ def test_two_files_of_a_boat(tmp_path):
 
 
 def test_a_pose_alone(tmp_path, capsys):
-    """A heading beside x and y is read; a filter of one sensor has its distances without a name."""
+    """A heading next to x and y is read; a filter of one sensor has its distances without a name."""
     time = np.arange(0, 10, 0.1)
     circle = np.c_[time, np.sin(time), 1 - np.cos(time), (time + np.pi) % (2 * np.pi) - np.pi]
     np.savetxt(

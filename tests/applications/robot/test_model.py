@@ -17,7 +17,7 @@ def flags(*places):
 
 
 def moved(state, dt):
-    """The state after dt, angles not wrapped."""
+    """Returns the state after dt, angles not wrapped."""
     roll, pitch, _ = state[3:6]
     rates = np.array(
         [
@@ -172,7 +172,7 @@ def test_held_velocities_are_means_of_the_step(float64):
     torch.testing.assert_close(moved[[0, 1, 5]], torch.tensor([2**0.5, 2**0.5, torch.pi / 2]))
 
 
-def test_what_is_not_honoured_is_named():
+def test_ignored_settings_are_named():
     model = robot_model(
         config(
             True,

@@ -28,7 +28,7 @@ def scene():
 
 
 def flange(joints):
-    """The flange in the table's frame; the maker's base frame has its x axis away from the table."""
+    """Returns the flange in the table's frame; the maker's base frame has its x axis away from the table."""
     pose = np.diag([-1.0, -1.0, 1.0, 1.0])
     pose[:3, 3] = BASE
     for q, a, d, alpha in zip(joints, A, D, ALPHA, strict=True):
@@ -76,7 +76,7 @@ def test_minimum_jerk():
     assert tau[speed.argmax()] == pytest.approx(0.5, abs=1e-3)
 
 
-def test_a_path_is_straight_in_space_and_ends_where_it_should(scene):
+def test_path_is_straight_and_ends_at_the_target(scene):
     start = np.append(inverse_kinematics(scene, np.array([-0.1, 0.1, 0.3]), tool_down(0.2, 0.2), READY), 0.8)
     waypoints = [
         Waypoint(np.array([0.1, -0.1, 0.1]), tool_down(-0.5, 0.1), 0.8, 60),

@@ -14,7 +14,7 @@ NAMES = ["shoulder", "elbow", "wrist"]
 
 
 def colours(episode, length):
-    """Mean colour of each frame: neighbours differ by 14 grey values in red, so that a shift by one shows."""
+    """Returns the mean colour of each frame; neighbours differ by 14 in red, so that a shift by one shows."""
     k = np.arange(length)
     return np.stack([20 + 14 * k, 230 - 10 * k, np.full(length, 40 + 30 * episode)], -1)
 
@@ -92,7 +92,7 @@ def write_info(root, version, video, suffix="mp4", cameras=("observation.images.
 
 
 def write_version_2(root, lengths, *, version="v2.1", images=None, codec="FFV1", suffix="mkv"):
-    """``images``: None for videos; "bytes" in the parquet files; "path" or "folder" for files beside them."""
+    """``images``: None for videos; "bytes" in the parquet files; "path" or "folder" for files next to them."""
     write_info(root, version, images is None, suffix)
     lines, first = [], 0
     for episode, length in enumerate(lengths):

@@ -11,16 +11,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.data.lerobot.lerobot_folder import (
-    FPS,
-    SIZE,
-    actions,
-    joints,
-    pictures,
-    write_info,
-    write_version_2,
-    write_version_3,
-)
+from benchmarks.reliability.damage import put
+from benchmarks.reliability.documents import edited
+from tests.data.lerobot.lerobot_folder import SIZE, actions, joints, pictures, write_version_2, write_version_3
 from tests.data.lerobot.test_errors import edit_table
 from torch_denkf.data import LeRobotReplay
 
@@ -47,47 +40,12 @@ def with_lengths(root, version, lengths):
         write_version_2(root, lengths)
 
 
-def announce(root, version, episode, length):
-    """Writes another length into the metadata."""
-    if version == 2:
-        file = root / "meta/episodes.jsonl"
-        entries = [json.loads(line) for line in file.read_text().splitlines()]
-        entries[episode]["length"] = length
-        file.write_text("\n".join(map(json.dumps, entries)))
-        return
-    file = root / "meta/episodes/chunk-000/file-000.parquet"
-    entries = parquet.read_table(file).to_pylist()
-    entries[episode]["length"] = length
-    parquet.write_table(pa.Table.from_pylist(entries), file)
-
-
-@pytest.mark.parametrize("version", [2, 3])
-def test_an_episode_of_no_length_that_has_rows(tmp_path, version):
-    with_lengths(tmp_path, version, [4, 5, 3])
-    announce(tmp_path, version, 1, 0)
-    with pytest.raises(ValueError, match="has 5 rows of episode 1, but the metadata says 0; download both again"):
-        open_all(tmp_path)
-    assert len(open_all(tmp_path, episodes=[0, 2])) == 7
-
-
 def test_an_episode_that_was_given_up(tmp_path):
     """It has neither rows nor files, or a file without its rows."""
     write_version_2(tmp_path, [4, 5, 3])
-    announce(tmp_path, 2, 1, 0)
+    edited(put((1, "length"), 0))(tmp_path / "meta/episodes.jsonl")
     (tmp_path / "data/chunk-000/episode_000001.parquet").unlink()
     assert [episode.number for episode in open_all(tmp_path).episodes] == [0, 2]
-
-
-@pytest.mark.parametrize("fps", [2 * FPS, FPS / 2, 1.3 * FPS])
-def test_times_that_contradict_fps(tmp_path, fps):
-    write_version_2(tmp_path, [6])
-    edit_info(tmp_path, fps=fps)
-    with pytest.raises(
-        ValueError, match=rf"episode 0: timestamps are 0.1 s apart, but fps in meta/info.json is {fps:g}"
-    ):
-        open_all(tmp_path)
-    edit_info(tmp_path, fps=1.1 * FPS)
-    assert_close(open_all(tmp_path)[:]["time"].flatten(), torch.arange(6).double() / FPS, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["actions", "observation.command", "motor_cmd"])
@@ -141,23 +99,6 @@ def test_videos_that_are_missing(tmp_path):
     assert_close(data[:]["pixels"], torch.from_numpy(shown).float() / 255)
 
 
-@pytest.mark.parametrize(
-    ("episodes", "match"),
-    [
-        ([], r"episodes holds numbers of episodes, such as \[0, 2\].*got \[\]"),
-        (1, "episodes holds numbers of episodes.*got 1"),
-        ("0", "episodes holds numbers of episodes.*got '0'"),
-        ([0, 7], r"episodes names \[7\], but .*episodes.jsonl lists 0, 1"),
-        (["0"], r"episodes names \['0'\], but"),
-        ([[0]], r"episodes names \[\[0\]\], but"),
-    ],
-)
-def test_episodes_that_are_not_there(tmp_path, episodes, match):
-    write_version_2(tmp_path, [3, 3])
-    with pytest.raises(ValueError, match=match):
-        open_all(tmp_path, episodes=episodes)
-
-
 @pytest.mark.parametrize("cached", [False, True])
 def test_large_numbers(tmp_path, cached):
     """Counts encoders up to 2.1e9: float32 swallows steps of 7; behind an origin they are there."""
@@ -180,17 +121,3 @@ def test_large_numbers(tmp_path, cached):
     each = open_all(root, **options, origin={"state": [2.1e9, 2.1e9 + 7, 2.1e9], "action": 1.0}, dims=[1])[:]
     assert_close(each["state"], torch.from_numpy(ticks - 7)[:, 1:2].float())
     assert_close(each["action"], torch.from_numpy(actions(0, 40) - 1))
-
-
-def test_a_stamp_that_is_missing_leaves_the_others_their_steps(tmp_path):
-    write_version_2(tmp_path, [20])
-    file = tmp_path / "data/chunk-000/episode_000000.parquet"
-    times = np.arange(20) / FPS
-    times[7] = np.nan
-    edit_table(file, timestamp=pa.array(times))
-    with pytest.warns(UserWarning, match="1 of 20 rows have a timestamp that does not increase"):
-        data = open_all(tmp_path)
-    assert_close(data[:]["time"].flatten(), torch.arange(20).double() / FPS)
-    write_info(tmp_path, "v2.1", True, "mkv", fps=FPS * 2)
-    with pytest.raises(ValueError, match=r"timestamps are 0.1 s apart"):
-        open_all(tmp_path)

@@ -15,7 +15,7 @@ EPISODES, LENGTH, SIZE = 20, 60, (24, 32)
 
 
 def joints(generator):
-    """Two smooth joint paths of every episode, ``[EPISODES, LENGTH + 20, 2]``, with room on both sides."""
+    """Returns two smooth joint paths of every episode, ``[EPISODES, LENGTH + 20, 2]``, with room on both sides."""
     step = torch.arange(LENGTH + 20) / 10
     phase = 6.3 * torch.rand(EPISODES, 2, 3, generator=generator)
     pace = torch.tensor([0.7, 1.3, 2.1])
@@ -23,7 +23,7 @@ def joints(generator):
 
 
 def drawn(place):
-    """A soft spot at ``place`` [n, 2] in -1..1, uint8 ``[n, 3, H, W]``."""
+    """Returns a soft spot at ``place`` [n, 2] in -1..1, uint8 ``[n, 3, H, W]``."""
     rows, columns = (torch.linspace(-1.2, 1.2, n) for n in SIZE)
     down, right = (place[:, k].view(-1, 1, 1) for k in (0, 1))
     spot = (-((rows.view(-1, 1) - down) ** 2 + (columns - right) ** 2) / 0.8).exp()

@@ -7,7 +7,7 @@ SIZE = (24, 32)
 
 
 def grey(number):
-    """A picture whose brightness tells its number, RGB."""
+    """Returns a picture whose brightness tells its number, RGB."""
     return np.full((*SIZE, 3), (10 + 4 * number, 200 - 3 * number, 7), np.uint8)
 
 

@@ -27,7 +27,7 @@ def write_varying(av, file, times):
         container.mux(stream.encode())
 
 
-def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
+def test_variable_frame_rate_loses_no_frame(tmp_path):
     av = pytest.importorskip("av")
     times = np.array([0.0, 0.5, 1.0, *(1.5 + np.arange(40) / 200)])
     write_varying(av, tmp_path / "run.mkv", times)
@@ -38,7 +38,7 @@ def test_no_frame_is_lost_where_the_rate_varies(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.mkv", "run.avi"])
-def test_a_video_that_lost_its_end_is_told(tmp_path, name):
+def test_truncated_video_is_reported(tmp_path, name):
     file = tmp_path / name
     write_video(file, 12)
     with warnings.catch_warnings():
@@ -52,43 +52,6 @@ def test_a_video_that_lost_its_end_is_told(tmp_path, name):
         assert len(left) < 12
         shown = (10 * left["time"]).round().int().tolist()
         assert (left["pixels"].numpy() == np.stack([grey(k).transpose(2, 0, 1) for k in shown])).all()
-
-
-def test_pictures_behind_a_damaged_one_keep_their_times(tmp_path):
-    write_images(tmp_path / "run", [f"{k}.png" for k in range(4)])
-    (tmp_path / "run" / "1.png").write_bytes(b"nothing")
-    images = Images(tmp_path / "run", times=[0.0, 1.0, 3.0, 7.0])
-    with pytest.warns(UserWarning, match="1.png cannot be decoded"):
-        data = RecordingReplay(Recording(camera=images), size=SIZE, cache=None)
-    assert data[:]["time"].squeeze(-1).tolist() == [0, 3, 7]
-
-
-def pipe(file):
-    os.mkfifo(file)
-
-
-@pytest.mark.parametrize(
-    ("name", "make", "match"),
-    [
-        (
-            "0.2.jpg",
-            lambda file: shutil.copy(file.with_name("0.1.png"), file),
-            r"0.2.png and 0.2.jpg are two images of",
-        ),
-        ("0.25.png", pipe, r"0.25.png is no file, but a pipe"),
-        (
-            "0.25.png",
-            lambda file: file.symlink_to("nowhere.png"),
-            r"0.25.png is no file, but a pipe, .* link to nowhere",
-        ),
-        ("0.20.png", lambda file: shutil.copy(file.with_name("0.1.png"), file), r"'time' goes from 0.2 to 0.2 s"),
-    ],
-)
-def test_two_images_of_a_frame_and_what_is_no_file(tmp_path, name, make, match):
-    write_images(tmp_path / "run", [f"{k / 10:.1f}.png" for k in range(5)])
-    make(tmp_path / "run" / name)
-    with pytest.raises(ValueError, match=match):
-        Images(tmp_path / "run").read(SIZE, None, False)
 
 
 def test_names_that_are_no_utf_8(tmp_path):

@@ -69,7 +69,7 @@ def test_pictures_and_interpolation_before_and_after_their_time(tmp_path):
 
 
 def late_files(folder, seed=0):
-    """An encoder of 10 Hz, and a GPS whose fixes arrive 0.05 to 0.9 s after they were taken, some after later ones."""
+    """Returns an encoder at 10 Hz, and a GPS with a latency of 0.05 to 0.9 s, so that fixes arrive out of order."""
     generator = np.random.default_rng(seed)
     taken = np.sort(generator.uniform(0, 6, 12))
     arrived = taken + generator.uniform(0.05, 0.9, 12)
@@ -82,7 +82,7 @@ def late_files(folder, seed=0):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("span", ["common", "all"])
-def test_a_reading_stands_in_the_row_after_it_arrived(tmp_path, seed, span):
+def test_reading_is_in_the_row_after_its_arrival(tmp_path, seed, span):
     recording, taken, arrived = late_files(tmp_path, seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

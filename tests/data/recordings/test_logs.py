@@ -68,24 +68,8 @@ def test_numbers_that_float32_holds_are_not_warned_of(tmp_path):
     assert_close(rows, torch.tensor(np.stack(list(columns.values()), 1), dtype=torch.float32))
 
 
-@pytest.mark.parametrize(
-    ("origin", "error", "match"),
-    [
-        ({"z": 1.0}, ValueError, r"origin names \['z'\], but .*run.csv is read for \['x'\]"),
-        ({"x": np.nan}, ValueError, "origin of 'x' must be a finite number"),
-        ({"x": "far"}, ValueError, "origin of 'x' must be a finite number.*'far'"),
-        ({"x": [1.0, 2.0]}, ValueError, "origin of 'x' must be a finite number"),
-        (5.0, TypeError, "origin holds numbers by the names of columns"),
-    ],
-)
-def test_origins_that_are_none(tmp_path, origin, error, match):
-    file = write_csv(tmp_path / "run.csv", time=[0.0, 1.0], x=[1.0, 2.0])
-    with pytest.raises(error, match=match):
-        replay(state=Table(file, origin=origin))
-
-
 def fixes(count=60, held=8, seed=0):
-    """A random walk at 10 Hz, read each ``held`` rows with a standard deviation of one, and repeated until then."""
+    """Returns a random walk at 10 Hz, read every ``held`` rows with unit noise, and repeated in between."""
     random = np.random.default_rng(seed)
     walk = random.normal(size=count * held).cumsum() * 0.3
     return walk, (walk[::held] + random.normal(size=count)).repeat(held), held
@@ -105,7 +89,7 @@ def test_a_fix_that_is_repeated_counts_once(tmp_path):
     assert (replay(state=state, gps=Table(file, ["gps"], repeats="keep")) == kept).all()
 
 
-def test_what_is_no_repeat(tmp_path):
+def test_values_that_are_no_repeats(tmp_path):
     """A robot that stands, an encoder's ticks, a temperature, commands that are held."""
     random, count = np.random.default_rng(0), 400
     speed = random.normal(size=count)
@@ -128,7 +112,7 @@ def test_arrivals_of_repeated_fixes(tmp_path):
 
 
 def queued(rate, count=2000):
-    """Steps by 0.2 ms at 5 % of the stamps, and by 0.16 s at 2 %; the others make up for both."""
+    """Returns steps by 0.2 ms at 5 % of the stamps, and by 0.16 s at 2 %; the others make up for both."""
     steps = np.full(count, 1 / rate)
     order = np.random.default_rng(0).permutation(count)
     steps[order[: count // 20]], steps[order[-count // 50 :]] = 2e-4, 0.16
@@ -136,7 +120,7 @@ def queued(rate, count=2000):
 
 
 def bursts(count=1000):
-    """A sensor of 100 Hz, of whose stamps some are those of a queue that is emptied at once."""
+    """Returns a sensor of 100 Hz, of whose stamps some are those of a queue that is emptied at once."""
     time = np.arange(count) * 0.01
     for first in range(20, count - 20, 50):
         time[first : first + 18] = time[first + 18] - 0.0002 * np.arange(18, 0, -1)

@@ -12,7 +12,7 @@ LATE = {"wheels": 0.1, "gps": 0.3}
 
 
 def drive(seed, seconds=120.0, noise=0.05):
-    """A gyro at 100 Hz, wheels at 20 Hz and 0.1 s late, GPS at 5 Hz and 0.3 s late; none in common units."""
+    """Returns a gyro at 100 Hz, wheels at 20 Hz and 0.1 s late, GPS at 5 Hz and 0.3 s late; none in common units."""
     rng, dt, count = np.random.default_rng(seed), 0.01, round(100 * seconds)
     turn, speed = np.zeros(count), np.full(count, 2.0)
     for k in range(1, count):
@@ -34,7 +34,7 @@ def drive(seed, seconds=120.0, noise=0.05):
 
 
 def test_delays_that_are_known():
-    """Within .05 s, and 95 % of the intervals hold: of 40 at least 34, which 38 hold on average."""
+    """Errors are below .05 s, and the coverage of the 95 % intervals is at least 34 of 40 (38 expected)."""
     held = 0
     for seed in range(20):
         tables = drive(seed)
@@ -48,7 +48,7 @@ def test_delays_that_are_known():
     assert held >= 34
 
 
-def test_scales_tell_units():
+def test_units_from_scales():
     tables = drive(0)
     scales = {(delay.late, delay.early): delay.scale for delay in delays_between(tables, most=2.0)}
     assert scales["gps", "wheels"] == pytest.approx(1 / 3.6, rel=0.05)

@@ -30,7 +30,7 @@ def read(tmp_path, text, name="run.csv", **options):
         (GOOD.replace("y", "größe"), {"name": "ü 漢字.csv"}),
     ],
 )
-def test_what_is_read(tmp_path, text, options):
+def test_columns_that_are_read(tmp_path, text, options):
     readings = read(tmp_path, text, **options)
     np.testing.assert_array_equal(readings.times, [0, 0.1, 0.2])
     np.testing.assert_array_equal(readings.values[:, 0], [0, 1, 2])

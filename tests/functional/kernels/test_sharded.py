@@ -20,7 +20,7 @@ def ranks(tmp_path_factory):
 
 
 def joined(ranks, case):
-    """The processes' columns side by side; what all of them hold, once."""
+    """Returns the processes' columns side by side; what all of them hold, once."""
     first, second = (rank[case] for rank in ranks)
     columns = ("ensemble", "innovation", "mean", "var")
     for name in first.keys() - set(columns):

@@ -44,7 +44,7 @@ def test_solution_and_gradients_are_those_of_linalg(float64, size):
         torch.testing.assert_close(value, expected, rtol=1e-11, atol=1e-11)
 
 
-def test_what_is_not_positive_definite_is_nan_and_alone(float64):
+def test_indefinite_matrices_give_nan_in_their_row_only(float64):
     gram, cross, shift, mean_shift = systems(2)
     gram[1] = torch.tensor([[-3.0, 0.0], [0.0, 1.0]])
     for value in solutions(gram, cross, shift, mean_shift):

@@ -14,7 +14,7 @@ MEMBERS = 8
 
 
 def problem(dtype=torch.float64, observations=25_000, batch=2):
-    """All components of a forecast, readings of noise and mask; and draws for the schemes that need any."""
+    """Returns all components of a forecast, readings of noise and mask; and draws for the schemes that need any."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
@@ -30,7 +30,7 @@ def problem(dtype=torch.float64, observations=25_000, batch=2):
 
 
 def share(sizes, rank):
-    """The columns of a process."""
+    """Returns the columns of a process."""
     return slice(sum(sizes[:rank]), sum(sizes[: rank + 1]))
 
 

@@ -1,4 +1,4 @@
-"""Everything that only a car needs: KITTI, a rendered street, sensors, motion, filter, metrics, pictures."""
+"""Application to cars: KITTI, a rendered street, sensors, motion, filter, metrics, plots."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Optical flow of a camera's images, on the fly."""
+"""Transform that computes the optical flow of a camera's images."""
 
 from __future__ import annotations
 
@@ -21,19 +21,18 @@ __all__ = ["OpticalFlow"]
 
 
 class OpticalFlow(Checked, Transform):
-    """Adds what :class:`torch_denkf.applications.car.FlowSensor` reads, from a frame and its difference to the one
-    before.
+    """Adds the inputs of :class:`torch_denkf.applications.car.FlowSensor`, from a frame and its difference to the last.
 
-    It keeps nothing between steps: the frame before is the frame less the difference, as
-    :class:`torch_denkf.applications.car.KITTIReplayEnv` emits them. :func:`torch_denkf.applications.car.with_motion`
-    computes the same for a recorded drive once.
+    It is stateless: the frame before is the frame minus the difference, the outputs of
+    :class:`torch_denkf.applications.car.KITTIReplayEnv`. :func:`torch_denkf.applications.car.with_motion` computes the
+    same once for a recorded drive.
 
     Args:
         calibration: (fx, fy, cx, cy) of the camera, in pixels of the images.
-        height: of the camera over the road, in m.
+        height: height of the camera over the road, in m.
         in_key: frames and differences ``[*B, 2C, H, W]``, float in [0, 1] and [-1, 1]; C is 1 or 3.
-        out_keys: where to write the flow ``[*B, 3, 25, 79]`` and the road's correlation ``[*B, 13, 69]``, float32.
-        observed_key: optional mask ``[*B, 1]``; both are zero where it is False.
+        out_keys: keys of the flow ``[*B, 3, 25, 79]`` and the road's correlation ``[*B, 13, 69]``, float32.
+        observed_key: optional mask ``[*B, 1]``; both are zero if it is False.
 
     Raises:
         KeyError: if there are no pixels.

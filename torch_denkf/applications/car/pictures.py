@@ -1,4 +1,4 @@
-"""A car's drive with a failing camera in one figure: what the camera showed, the map, and the velocities."""
+"""Figure of a car's drive with a failing camera: images, map, and velocities."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 __all__ = ["BANDS", "NamedSpan", "drive_picture", "named_frames", "path_options"]
 
-#: What :func:`torch_denkf.plots.plot_bands` draws of a car.
+#: Arguments of :func:`torch_denkf.plots.plot_bands` for a car.
 BANDS: dict[str, Any] = {"dims": [3, 4], "names": ["speed, m/s", "turn rate, deg/s"], "factors": [1.0, math.degrees(1)]}
 _SHADES = ("#F9D3B4", "#D5D5D5", "#FFEB85")
 
 
 class NamedSpan(NamedTuple):
-    """A stretch of steps with a name, such as a failure of the camera.
+    """Named span of steps, such as a failure of the camera.
 
     Attributes:
-        name: to be shown.
-        first: step.
-        last: step, included.
+        name: label.
+        first: first step.
+        last: last step, included.
     """
 
     name: str
@@ -43,7 +43,7 @@ def path_options(tracked: TensorDictBase) -> dict[str, Any]:
 
 
 def named_frames(images: Sequence[np.ndarray], spans: Sequence[NamedSpan]) -> list[np.ndarray]:
-    """Writes the name of the span that a frame lies in, if any, in its lower left corner: ``[H, W, 3]``, RGB, each."""
+    """Writes the name of each frame's span, if any, in its lower left corner; frames are ``[H, W, 3]``, RGB."""
     out = []
     for step, image in enumerate(images):
         for span in spans:
@@ -58,16 +58,16 @@ def named_frames(images: Sequence[np.ndarray], spans: Sequence[NamedSpan]) -> li
 def drive_picture(
     tracked: TensorDictBase, images: Sequence[np.ndarray], spans: Sequence[NamedSpan], title: str = ""
 ) -> Figure:
-    """Draws a still of the whole drive: the camera's picture at four times, the map, and velocities with 90 % bands.
+    """Draws the whole drive: the camera's image at four times, the map, and velocities with 90 % bands.
 
     Args:
         tracked: ``[T]`` with ``"belief"`` (``"mean"`` ``[T, 5]``, ``"var"``, ``"ensemble"`` ``[T, E, 5]``), ``"state"``
             ``[T, 5]``, ``"dead_reckoning"`` ``[T, 3]`` and ``"time"`` ``[T, 1]``, such as
             :func:`torch_denkf.applications.car.odometry.failing_drive.track_failing_drive` returns; the state is a
             car's [x, y, theta, v, theta_dot].
-        images: of the steps, as the camera showed them.
-        spans: failures of the camera; at most three are pictured.
-        title: headline.
+        images: images of the camera at the steps.
+        spans: failures of the camera; at most three are drawn.
+        title: title of the figure.
 
     Returns:
         The figure; ``figure.savefig("drive.png")`` writes it.

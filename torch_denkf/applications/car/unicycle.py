@@ -1,4 +1,4 @@
-r"""The known motion of a vehicle on the plane: a pose moves with speed and turn rate, at the heading of mid-step."""
+r"""Unicycle motion of a vehicle on the plane: a pose moves with speed and turn rate along the mid-step heading."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def unicycle_move(pose: Tensor, velocity: Tensor, dt: float | Tensor) -> Tensor:
         y' = y + v\,\Delta t \sin(\theta + \dot\theta \Delta t / 2), \quad
         \theta' = \theta + \dot\theta \Delta t
 
-    With ``-dt`` it is its own inverse, exactly but for rounding.
+    The call with ``-dt`` is the inverse, up to rounding.
 
     Args:
         pose: (x m, y m, theta rad), ``[*, 3]``.
@@ -45,7 +45,7 @@ def unicycle_jacobians(pose: Tensor, velocity: Tensor, dt: float | Tensor) -> tu
         dt: time step in s, a number or ``[*, 1]``.
 
     Returns:
-        The derivatives by the pose ``[*, 3, 3]`` and by the velocity ``[*, 3, 2]``.
+        Derivatives with respect to the pose ``[*, 3, 3]`` and the velocity ``[*, 3, 2]``.
 
     Examples:
         >>> unicycle_jacobians(torch.zeros(3), torch.tensor([10.0, 0.0]), 0.1)[1]

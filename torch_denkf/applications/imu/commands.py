@@ -22,10 +22,10 @@ _COLUMNS = {
 
 @dataclass
 class Orient(Command):
-    """Writes an orientation with its standard deviations for each reading of a log, and a picture.
+    """Writes the orientation at each reading of a log with standard deviations, and a figure.
 
     A log is an .npz file with gyro (rad/s), acceleration (m/s^2), magnetometer (uT), each [T, 3], and rate (Hz); or a
-    CSV file with the columns t (s), gx, gy, gz, ax, ay, az, mx, my, mz. Without a magnetometer heading is relative.
+    CSV file with the columns t (s), gx, gy, gz, ax, ay, az, mx, my, mz. Without a magnetometer the heading is relative.
     """
 
     log: Path  # .npz or .csv
@@ -69,11 +69,11 @@ class Orient(Command):
 
 
 def read_log(file: Path) -> tuple[dict[str, ndarray], float]:
-    """Reads the readings of a log ``[T, 3]`` by name, in float64, and how many there are a second.
+    """Loads the readings of a log ``[T, 3]`` by name, in float64, and their rate in Hz.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no log, or the times of a CSV file are not even.
+        ValueError: if it is no log, or the times of a CSV file are not equidistant.
     """
     import numpy as np
 

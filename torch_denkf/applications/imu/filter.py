@@ -1,4 +1,4 @@
-"""The filter of an inertial sensor's orientation, whose acceleration and magnetic errors are part of the model."""
+"""Filter of an inertial sensor's orientation, with acceleration and magnetic disturbances in the state."""
 
 from __future__ import annotations
 
@@ -28,46 +28,46 @@ BIAS, FIELD = 4, 28  # their places in a point
 
 @dataclass(frozen=True)
 class ImuSettings:
-    """All numbers that an :class:`ImuFilter` is built from.
+    """Settings of an :class:`ImuFilter`.
 
     Attributes:
         gyro: density of the gyro's white noise in rad/s/sqrt(Hz).
-        gyro_rate: what is added to it per rad/s of rotation.
-        gyro_walk: of the gyro's bias, in rad/s^2/sqrt(Hz).
-        gyro_bias: standard deviation of that bias at the start, in rad/s.
-        gyro_scale: standard deviation of the errors of the gyro's scales.
-        gyro_skew: of those of its axes' directions, in rad.
+        gyro_rate: increase of ``gyro`` per rad/s of rotation.
+        gyro_walk: random walk of the gyro's bias, in rad/s^2/sqrt(Hz).
+        gyro_bias: initial standard deviation of that bias, in rad/s.
+        gyro_scale: standard deviation of the gyro's scale factor errors.
+        gyro_skew: standard deviation of the gyro's axis misalignments, in rad.
         poles: the three rates, in 1/s, of the process whose output is the position of the body about a place.
         motion: standard deviation that sets the size of the acceleration of a resting body, in m/s^2.
-        motion_unrest: what is added to it per m/s^2 of ``"unrest"``.
-        motion_start: standard deviation of position, velocity and acceleration at the start.
+        motion_unrest: increase of ``motion`` per m/s^2 of ``"unrest"``.
+        motion_start: initial standard deviation of position, velocity and acceleration.
         accelerometer: standard deviation of the mean over a block, in m/s^2.
-        magnetometer: of the mean over a block, in uT.
-        magnetometer_rate: what is added to it per rad/s of rotation.
-        magnetic_bias: standard deviation of the magnetometer's bias at the start, in uT.
-        magnetic_walk: of that bias, in uT/sqrt(s).
+        magnetometer: standard deviation of the mean over a block, in uT.
+        magnetometer_rate: increase of ``magnetometer`` per rad/s of rotation.
+        magnetic_bias: initial standard deviation of the magnetometer's bias, in uT.
+        magnetic_walk: random walk of that bias, in uT/sqrt(s).
         field: standard deviation of the first reading of the magnetic field, in uT.
-        field_walk: of the field, in uT/sqrt(s).
-        stray: standard deviation of the stray field, which comes and goes, about each axis, in uT.
-        stray_unrest: what is added to it per uT of ``"disturbance"``.
-        stray_time: in which it fades to 1/e, in s.
-        lag: how much later the magnetometer reads than the gyro, in s.
-        lag_std: standard deviation of that number.
-        lever: standard deviation of the lever at the start, about each axis, in m: whatever is held in a hand turns
-            about a joint, so that its acceleration follows from how it turns.
-        lever_walk: of the lever, in m/sqrt(s).
-        tilt: standard deviation of the inclination at the start, in rad.
-        heading: of the heading at the start, in rad.
-        rest: of the gyro's mean over a block at rest, in rad/s.
+        field_walk: random walk of the field, in uT/sqrt(s).
+        stray: standard deviation of the time-varying stray field along each axis, in uT.
+        stray_unrest: increase of ``stray`` per uT of ``"disturbance"``.
+        stray_time: time constant of the stray field, in s.
+        lag: delay of the magnetometer relative to the gyro, in s.
+        lag_std: standard deviation of ``lag``.
+        lever: initial standard deviation of the lever arm along each axis, in m: a hand-held sensor rotates about a
+            joint, so that its acceleration follows from its rotation.
+        lever_walk: random walk of the lever arm, in m/sqrt(s).
+        tilt: initial standard deviation of the inclination, in rad.
+        heading: initial standard deviation of the heading, in rad.
+        rest: standard deviation of the gyro's mean over a block at rest, in rad/s.
         gravity: in m/s^2.
-        block: seconds of readings that make one step.
-        latency: how old the readings are when they get their time stamp, in s; orientations are moved on by it.
-        heading_scale: factor on the standard deviation of the heading, so that the intervals hold.
+        block: duration of the readings of one step, in s.
+        latency: delay between readings and their time stamps, in s; orientations are predicted by it.
+        heading_scale: factor on the standard deviation of the heading, which sets the coverage.
         heading_floor: least standard deviation of the heading, in degrees.
         tilt_scale: factor on the standard deviations of the inclination.
         tilt_floor: least standard deviation of the inclination about each axis, in degrees.
-        place: the earth's field northwards and upwards there, in uT, if it is known. As far as the estimated field is
-            off in these directions it may be off eastwards, too: the heading's standard deviation is so much larger.
+        place: north and up components of the local earth's field, in uT, if known. The heading's standard deviation
+            increases with the deviation of the estimated field from them, as an unknown east component is as likely.
     """
 
     gyro: float = 1e-3
@@ -120,14 +120,15 @@ class ImuSettings:
 
 
 class ImuMotion(Motion):
-    r"""Turns the orientation by the gyro, and moves the body about a place.
+    r"""Rotates the orientation by the gyro, and moves the body about a fixed point.
 
     The gyro reads :math:`\omega + b + M \tilde\omega`. The position is the output of a linear process of third order
-    with white noise at its input, so that neither velocity nor position run away: what the accelerometer reads for long
-    is gravity. ``"moves"`` ``[*B, 9]`` is that process' transition matrix, see :func:`moves`. The stray field fades.
+    with white noise at its input, so that velocity and position stay bounded: the mean of the accelerometer over long
+    times is gravity. ``"moves"`` ``[*B, 9]`` is that process' transition matrix, see :func:`moves`. The stray field
+    fades.
 
     Args:
-        stray_time: in which it fades to 1/e, in s.
+        stray_time: time constant of the stray field, in s.
     """
 
     stray_time: Tensor
@@ -137,7 +138,7 @@ class ImuMotion(Motion):
         self.register_buffer("stray_time", torch.tensor(stray_time))
 
     def move(self, state, gyro, moves, *, dt):
-        """Returns the state one step later."""
+        """Returns the state after one step."""
         orientation, bias, errors, position, velocity, acceleration, *others, stray, lever = SPACE.points(state)
         turn = SO3().exp((gyro - bias - (errors.unflatten(-1, (3, 3)) * gyro.unsqueeze(-2)).sum(-1)) * dt)
         matrix, before = moves.unflatten(-1, (3, 3)), torch.stack([position, velocity, acceleration], -2)
@@ -164,7 +165,7 @@ def moves(poles: Sequence[float], dt: float) -> Tensor:
 
 
 class ImuNoise(SubModel):
-    """Variances ``[*B, 36]`` that a step adds, learnable: of the gyro, the motion's acceleration and slow errors.
+    """Process noise variances ``[*B, 36]``, learnable: of the gyro, the motion's acceleration and slow errors.
 
     Args:
         settings: the numbers before training.
@@ -199,14 +200,14 @@ class _Accelerometer(SubModel):
         self.register_buffer("up", torch.tensor([0.0, 0.0, gravity]))
 
     def compute(self, state, lever):
-        """Sums gravity and the acceleration of the joint and about it; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
+        """Sums gravity and accelerations of and about the joint; ``lever`` ``[*B, 9]``, see :func:`imu_rows`."""
         parts = SPACE.points(state)
         about = (lever.unflatten(-1, (3, 3)).unsqueeze(-3) * parts[10].unsqueeze(-2)).sum(-1)
         return rotate(parts[0], self.up, back=True) + parts[5] + about
 
 
 class _Magnetometer(SubModel):
-    """The field that a magnetometer reads, which lags behind the gyro: ``[*B, E, 3]``."""
+    """Magnetometer readings, delayed relative to the gyro: ``[*B, E, 3]``."""
 
     def __init__(self):
         super().__init__(nn.Identity(), [("forecast", "ensemble"), "gyro"], [("forecast", "observation")])
@@ -219,7 +220,7 @@ class _Magnetometer(SubModel):
 
 
 class MagnetometerNoise(Sensor):
-    """Variances ``[*B, 3]`` of the magnetometer, larger while the body turns fast, learnable.
+    """Variances ``[*B, 3]`` of the magnetometer, learnable; they increase with the rate of rotation.
 
     Args:
         settings: the numbers before training.
@@ -232,7 +233,7 @@ class MagnetometerNoise(Sensor):
         self.log_std = nn.Parameter(torch.tensor([settings.magnetometer, settings.magnetometer_rate]).log())
 
     def compute(self, gyro):
-        """The variances."""
+        """Returns the variances."""
         white, rate = (2 * self.log_std).exp().unbind(-1)
         return (white + rate * gyro.square().sum(-1, keepdim=True)).expand_as(gyro)
 
@@ -277,7 +278,7 @@ class ImuFilter(FusedFilter):
 
 
 def imu(**settings) -> ImuFilter:
-    """A filter of an inertial sensor's orientation, with 9 or 6 axes.
+    """Returns a filter of an inertial sensor's orientation, with 9 or 6 axes.
 
     Args:
         **settings: those of :class:`ImuSettings`.

@@ -1,4 +1,4 @@
-"""A log of an inertial sensor: the rows that the filter reads, and an orientation for each reading."""
+"""Log of an inertial sensor: inputs of the filter, and an orientation for each reading."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Orientations(NamedTuple):
 def imu_rows(
     settings: ImuSettings, gyro: Tensor, acceleration: Tensor, magnetometer: Tensor | None = None, *, rate: float
 ) -> TensorDict:
-    """Makes the rows of :class:`ImuFilter` from a log: each is a block of readings, in the axes at the block's end.
+    """Makes the rows of :class:`ImuFilter` from a log: means of blocks of readings, in the axes at a block's end.
 
     The rotation within a block is exact: the gyro's readings are integrated one by one, and accelerometer and
     magnetometer are turned to the block's end before their mean is taken.
@@ -50,10 +50,10 @@ def imu_rows(
         gyro: ``[T, 3]`` in rad/s, finite.
         acceleration: ``[T, 3]`` in m/s^2; rows with NaN are missing.
         magnetometer: ``[T, 3]`` in uT, likewise; ``None`` for 6 axes.
-        rate: readings a second.
+        rate: readings per second.
 
     Returns:
-        Rows ``[N]``; readings behind the last whole block are left out.
+        Rows ``[N]``; readings after the last whole block are dropped.
 
     Raises:
         ValueError: if shapes or units are wrong, a gyro's reading is not finite, or there is no whole block.
@@ -123,17 +123,17 @@ def orientations(
     rate: float,
     smooth: bool = False,
 ) -> Orientations:
-    """Runs the filter on a log, and gives an orientation and its standard deviations for each reading.
+    """Filters a log, and returns an orientation with standard deviations for each reading.
 
-    Within a block the gyro turns the last belief; the standard deviations are those of that belief.
+    Within a block the last belief is rotated by the gyro; its standard deviations are unchanged.
 
     Args:
         model: of :func:`imu`, or ``from_pretrained("imu")``.
         gyro: ``[T, 3]`` in rad/s.
         acceleration: ``[T, 3]`` in m/s^2.
-        magnetometer: ``[T, 3]`` in uT; ``None`` for 6 axes, whose heading starts as north.
-        rate: readings a second.
-        smooth: whether all later readings count, too (Rauch-Tung-Striebel).
+        magnetometer: ``[T, 3]`` in uT; ``None`` for 6 axes, with an initial heading of north.
+        rate: readings per second.
+        smooth: whether to smooth (Rauch-Tung-Striebel).
 
     Raises:
         ValueError: see :func:`imu_rows`; or if the gyro's readings are in degrees a second.
@@ -177,7 +177,7 @@ def at_readings(settings: ImuSettings, mean: Tensor, cov: Tensor, gyro: Tensor, 
 
 
 def _check_unit_of(gyro: Tensor, acceleration: Tensor, rate: float) -> None:
-    """Raises if the mean force of seconds is no gravity in the axes that the gyro keeps, and is in degrees a second."""
+    """Raises if gravity is consistent with the gyro in degrees per second, but not in rad/s."""
     count = max(round(rate), 1)
     seconds = len(gyro) // count
     force = torch.where(acceleration.isfinite().all(-1, keepdim=True), acceleration, 0)
@@ -195,7 +195,7 @@ def _check_unit_of(gyro: Tensor, acceleration: Tensor, rate: float) -> None:
 
 
 def astray(settings: ImuSettings, mean: Tensor) -> Tensor:
-    """Returns the variance of the heading ``[N, 3]`` that a field unlike the place's says, zero of the inclination."""
+    """Returns added variances ``[N, 3]``: of the heading by the field's deviation from the local one, else zero."""
     field = mean[:, FIELD : FIELD + 2]
     if settings.place is None or not field.any():  # or 6 axes
         return mean.new_zeros(3)
@@ -204,19 +204,19 @@ def astray(settings: ImuSettings, mean: Tensor) -> Tensor:
 
 
 def block_size(settings: ImuSettings, rate: float) -> int:
-    """Returns how many readings make a block."""
+    """Returns the number of readings in a block."""
     return max(1, round(settings.block * rate))
 
 
 def _mean(readings: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the means of blocks ``[N, K, 3]`` over the readings that are there, and the mask ``[N, 1]``."""
+    """Returns the means of blocks ``[N, K, 3]`` over the available readings, and the mask ``[N, 1]``."""
     known = readings.isfinite().all(-1, keepdim=True)
     total = torch.where(known, readings, 0).sum(1) / known.sum(1).clamp_min(1)
     return total, known.any(1)
 
 
 def _running_mean(values: Tensor, dt: Tensor, time: float) -> Tensor:
-    """Returns exponentially weighted means of the rows so far ``[N, K]``; they start with the first row."""
+    """Returns exponentially weighted running means ``[N, K]``, initialised by the first row."""
     keep = (-dt[0, 0] / time).exp()
     found, step = torch.cat([values[:1], (1 - keep) * values[1:]]), 1
     while step < len(values):
@@ -226,7 +226,7 @@ def _running_mean(values: Tensor, dt: Tensor, time: float) -> Tensor:
 
 
 def _running_product(turns: Tensor) -> Tensor:
-    """Returns the products of the rotations ``[N, 4]`` behind the first, up to each."""
+    """Returns the cumulative products of the rotations ``[N, 4]`` after the first."""
     found, step = torch.cat([SO3().neutral(turns).unsqueeze(0), turns[1:]]), 1
     while step < len(turns):
         found = torch.cat([found[:step], SO3().compose(found[:-step], found[step:])])
@@ -235,7 +235,7 @@ def _running_product(turns: Tensor) -> Tensor:
 
 
 def _start(rows: TensorDict) -> Tensor:
-    """Returns the state that the first readings of accelerometer and magnetometer say; without one, north is x."""
+    """Returns the initial state by the first readings of accelerometer and magnetometer; without one, north is x."""
     first = rows["accelerometer_observed"].squeeze(-1).long().argmax()
     up = rows["accelerometer"][first]
     up = up / up.norm()

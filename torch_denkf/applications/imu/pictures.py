@@ -1,4 +1,4 @@
-"""A log's orientation in one figure."""
+"""Figure of the orientation over a log."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def orientation_picture(found: Orientations, rate: float, *, points: int = 4000)
 
     Args:
         found: of :func:`~torch_denkf.applications.imu.orientations`.
-        rate: readings a second.
-        points: at most as many are drawn.
+        rate: readings per second.
+        points: maximum number of points drawn.
     """
     every = max(1, len(found.quaternion) // points)
     seconds = torch.arange(0, len(found.quaternion), every) / rate

@@ -11,15 +11,15 @@ __all__ = ["contacts"]
 
 
 def contacts(force: Tensor, on: float, off: float | None = None, *, before: Tensor | None = None) -> Tensor:
-    """Detects contacts with hysteresis: from when the force exceeds ``on`` until it falls below ``off``.
+    """Detects contacts with hysteresis: a contact lasts from a force above ``on`` until a force below ``off``.
 
-    Two thresholds keep noise about one of them from lifting a foot that stands.
+    The hysteresis prevents chatter by noise at a single threshold.
 
     Args:
         force: upwards, ``[*B, T, F]``, time before feet; in N.
-        on: above it a foot stands.
-        off: below it a foot is in the air; between both it does what it did. ``None`` for half of ``on``.
-        before: which feet stood before the first row, ``[*B, F]`` bool; ``None`` where that is told by ``on`` alone.
+        on: threshold above which a contact begins.
+        off: threshold below which a contact ends. ``None`` for half of ``on``.
+        before: contacts before the first row, ``[*B, F]`` bool; ``None`` for no contact.
 
     Returns:
         ``[*B, T, F]`` bool.

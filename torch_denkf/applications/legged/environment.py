@@ -1,4 +1,4 @@
-"""A legged robot in MuJoCo, with the sensors that robots have, and their errors."""
+"""A legged robot in MuJoCo, with realistic sensors and their errors."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class LeggedErrors:
 
 
 class LeggedEnv(EnvBase):
-    """One robot in MuJoCo that emits what a legged robot reads, and the true motion of its base.
+    """Simulates one robot in MuJoCo; emits the readings of a legged robot, and the true motion of its base.
 
     Emits ``"imu"`` ``[6]`` (gyro in rad/s, accelerometer in m/s^2, in the sensor's axes: means over the step),
     ``"joints"`` and ``"joint_rates"`` ``[J]``, ``"force"`` ``[F]`` that presses each foot, in N, and ``"contact"``
@@ -73,14 +73,13 @@ class LeggedEnv(EnvBase):
         imu: name of the site of the sensor.
         dt: seconds of a step, a multiple of the model's.
         errors: of the sensors; ``None`` for :class:`LeggedErrors`.
-        on: force in N above which a foot counts as standing.
-        off: force below which it does no more.
-        pushes: standard deviation in N of forces on the base, level with the floor: one a second on average, for a
-            tenth of a second.
+        on: force in N above which a contact begins.
+        off: force below which it ends.
+        pushes: standard deviation in N of horizontal pushes of the base: one per second on average, for 0.1 s each.
         seed: of the errors and pushes.
 
     Raises:
-        ValueError: if the model has no accelerometer there, no free joint, or ``dt`` is no multiple of its step.
+        ValueError: if the model has no accelerometer at ``imu``, no free joint, or ``dt`` is no multiple of its step.
     """
 
     def __init__(
@@ -169,7 +168,7 @@ class LeggedEnv(EnvBase):
         data, total = self.data, np.zeros(6)
         for _ in range(self.substeps):
             self._simulate()
-            # The simulator goes on with the turn at the end of its step, and with the force at its beginning.
+            # The simulator has the rotation at the end of its step, but the force at its beginning.
             total[:3] += self.to_sensor @ data.qvel[3:6]
             total[3:] += data.sensordata[self.force_at : self.force_at + 3]
         force = self._forces()
@@ -216,13 +215,13 @@ class LeggedEnv(EnvBase):
 
 
 def on_floor(robot: ElementTree.Element, assets: dict, friction: float, softness: float) -> mujoco.MjModel:
-    """Returns a robot of dm_control on a floor, as its sensors need it.
+    """Returns the model of a dm_control robot on a floor, with settings for accurate sensors.
 
     Args:
         robot: its MJCF.
         assets: files that it includes.
-        friction: of feet and floor: the force along the floor by the force upon it.
-        softness: seconds in which the floor gives way and comes back.
+        friction: friction coefficient of feet and floor.
+        softness: time constant of the contact, in s.
 
     Raises:
         ValueError: if a number is not above zero.
@@ -232,7 +231,7 @@ def on_floor(robot: ElementTree.Element, assets: dict, friction: float, softness
     model = mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"), assets)
     model.opt.timestep = 0.0025
     model.opt.cone, model.opt.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 30.0  # feet that stand do not creep
-    # With implicit damping the simulator moves otherwise than its accelerometer reads, by a third.
+    # With implicit damping the simulated accelerometer deviates from the motion by a third.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     model.geom_friction[:, 0], model.geom_solref[:, 0] = friction, softness
     return model

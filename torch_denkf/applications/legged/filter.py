@@ -25,7 +25,7 @@ from torch_denkf.running import named_modules_of
 
 __all__ = ["legged_filter"]
 
-_FAR = 0.1  # m: how far a foot may be at the start from where its joints say; its first reading tells
+_FAR = 0.1  # m: initial standard deviation of a foot about its kinematics; the first reading corrects it
 
 
 def legged_filter(
@@ -47,7 +47,7 @@ def legged_filter(
     contact_key: NestedKey = "contact",
     **options: Any,
 ) -> Filter:
-    r"""Returns a filter of the base of a legged robot, from its inertial sensor, its joints, and which feet stand.
+    r"""Returns a filter of the base of a legged robot, from an inertial sensor, joint encoders, and foot contacts.
 
     ``("belief", "velocity")`` ``[*B, 3]`` is the velocity of the base in its own axes, in m/s, and
     ``("belief", "velocity_var")`` its variances. ``("belief", "mean")`` ``[*B, 16 + 3 F]`` holds the sensor's
@@ -55,9 +55,9 @@ def legged_filter(
     :class:`~torch_denkf.applications.legged.motion.LeggedSpace`. The world's origin is where the base starts, its
     heading is zero there. The robot must stand still at the start.
 
-    The sensor drives the motion, see :class:`~torch_denkf.applications.legged.motion.LeggedMotion`: what it reads at a
-    step is the mean over the time since the last one. Feet that stand are read: where they are by the joints' angles,
-    and, with ``rates_key``, how fast by their rates.
+    The inertial sensor drives the motion, see :class:`~torch_denkf.applications.legged.motion.LeggedMotion`: its
+    reading at a step is the mean over the time since the last step. Feet in contact are observed: their positions by
+    the joint angles and, with ``rates_key``, their velocities by the joint rates.
 
     Args:
         model: of the robot, from MJCF or URDF.
@@ -66,17 +66,17 @@ def legged_filter(
         joints: names of the joints in the order of the readings; ``None`` for all hinges and slides of the model.
         dt: time step in seconds, or the key of an entry ``[*B, 1]``.
         kind: the belief: an ensemble, or a mean and a covariance.
-        ensemble_size: E. Of a robot with F feet, 36 + 6 F members are drawn exactly; far fewer need a ``threshold``.
-        threshold: of the ensemble's significance, see :class:`~torch_denkf.modules.EnsembleAnalysis`; ``None`` to
-            believe all correlations.
-        noises: of the sensors and feet.
-        contacts: says how each standing foot moves, in the place of ``slip`` and ``rate`` of ``noises``; it needs
-            ``rates_key``. An ensemble takes its variances, and no correlation of a foot's axes.
+        ensemble_size: E. With F feet, exact draws need 36 + 6 F members; far fewer need a ``threshold``.
+        threshold: for localisation by significance, see :class:`~torch_denkf.modules.EnsembleAnalysis`; ``None`` for
+            no localisation.
+        noises: noise of the sensors and of the feet.
+        contacts: learned model of the slip of each foot in contact, instead of ``slip`` and ``rate`` of ``noises``; it
+            needs ``rates_key``. An ensemble uses its variances, without correlations of a foot's axes.
         gravity: in m/s^2.
         imu_key: ``[*B, 6]``: gyro in rad/s, then accelerometer in m/s^2, in the sensor's axes.
         joints_key: angles ``[*B, J]`` in rad.
-        rates_key: their rates ``[*B, J]`` in rad/s; ``None`` to read none.
-        contact_key: which feet stand, ``[*B, F]`` bool.
+        rates_key: joint rates ``[*B, J]`` in rad/s; ``None`` for no such sensor.
+        contact_key: contact of each foot, ``[*B, F]`` bool.
         **options: of :class:`~torch_denkf.filters.Filter`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""dm_control's humanoid, which a harness leads, and how it walks."""
+"""dm_control's humanoid in a moving harness, and its gait."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _HEIGHT = 1.24  # m: below it the harness carries
 
 
 class HarnessedEnv(LeggedEnv):
-    """A robot whose base hangs in a harness that goes along: it keeps the robot from falling, as in a laboratory.
+    """A robot with its base in a moving harness that prevents falls, as in a laboratory.
 
-    The harness is made of springs and dampers: it turns the base upright and to where it goes, pulls it after itself,
-    and carries it where it sinks. The legs carry the robot while it walks.
+    Springs and dampers of the harness align the base upright and with the heading, pull it along, and carry it if it
+    sinks. Otherwise the legs carry the robot.
 
     Args:
-        speed: of the harness, in m/s; it sets off within a second.
-        turn: how fast it turns, in rad/s.
+        speed: speed of the harness, in m/s, reached within a second.
+        turn: yaw rate of the harness, in rad/s.
         *args: of :class:`LeggedEnv`.
         **options: of :class:`LeggedEnv`.
     """
@@ -76,17 +76,17 @@ def humanoid_env(
     turn: float = 0.0,
     seed: int = 0,
 ) -> HarnessedEnv:
-    """Returns dm_control's humanoid in a harness, with an inertial sensor next to its chest, 100 steps a second.
+    """Returns dm_control's humanoid in a harness, with an inertial sensor next to its chest, 100 steps per second.
 
     Its motors turn joints to the angles of the action, in rad.
 
     Args:
         errors: of the sensors.
-        friction: of feet and floor: the force along the floor by the force upon it. On 0.3 feet slide.
-        softness: seconds in which the floor gives way and comes back.
+        friction: friction coefficient of feet and floor. With 0.3, feet slide.
+        softness: time constant of the contact, in s.
         pushes: standard deviation in N, see :class:`LeggedEnv`. The robot has 41 kg.
-        speed: of the harness, in m/s.
-        turn: how fast it turns, in rad/s.
+        speed: speed of the harness, in m/s.
+        turn: yaw rate of the harness, in rad/s.
         seed: of errors and pushes.
 
     Raises:
@@ -113,13 +113,13 @@ def humanoid_env(
 
 
 def stroll(time: float, *, pace: float = 1.0, stride: float = 0.2, lift: float = 0.4) -> torch.Tensor:
-    """Controls ``[21]`` of dm_control's humanoid that let it walk on bent legs, while the harness leads.
+    """Returns controls ``[21]`` of dm_control's humanoid for a walk on bent legs in the harness.
 
     Args:
         time: in s.
-        pace: strides a second.
-        stride: amplitude of the hips, in rad. A speed of about ``2.5 * stride * pace`` fits it, in m/s.
-        lift: by how much a knee bends that swings, in rad.
+        pace: strides per second.
+        stride: amplitude of the hips, in rad, for a speed of about ``2.5 * stride * pace`` in m/s.
+        lift: additional flexion of the knee in swing, in rad.
     """
     for name, value in {"time": time, "pace": pace, "stride": stride, "lift": lift}.items():
         check_number(name, value)

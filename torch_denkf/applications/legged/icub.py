@@ -32,7 +32,7 @@ _ON, _OFF = 60.0, 40.0  # N, of the force under a foot; iCub weighs 330 N
 
 
 def icub_model(folder: Path) -> mujoco.MjModel:
-    """Returns the robot's chains of joints, without meshes, from ``model.urdf`` in a folder."""
+    """Loads the robot's kinematic model, without meshes, from ``model.urdf`` in a folder."""
     robot = ElementTree.parse(folder / "model.urdf").getroot()
     for parent in (robot, *robot.findall("link")):
         for child in list(parent):
@@ -74,7 +74,7 @@ def icub_log(folder: Path) -> TensorDict:
 
 
 def savitzky_golay(values: torch.Tensor, time: torch.Tensor, rows: int = 21, order: int = 3) -> torch.Tensor:
-    """Returns derivatives ``[T, N]`` of ``[T, N]``: of the polynomial through the rows about each; ends are held."""
+    """Returns derivatives ``[T, N]`` of values by local polynomials; they are constant at the ends."""
     half = rows // 2
     at = torch.arange(len(time)).clamp(half, len(time) - 1 - half)
     window = at.unsqueeze(-1) + torch.arange(-half, half + 1)

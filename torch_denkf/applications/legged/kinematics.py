@@ -19,19 +19,18 @@ _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name
 class LegKinematics(nn.Module):
     """Positions and velocities of feet in an inertial sensor's axes, by joint angles, for any batch.
 
-    The chain of each foot is read out of the model once; chains are padded to one length and run side by side. It is
-    what ``mujoco.mj_kinematics`` computes, and can be differentiated. The sensor must sit on the base: no joint may lie
-    between both.
+    The kinematic chain of each foot is extracted from the model once; chains are padded to one length and computed in
+    parallel. The result is that of ``mujoco.mj_kinematics``, and differentiable. The sensor must be fixed to the base.
 
     Args:
         model: a ``mujoco.MjModel``, from MJCF or URDF.
         feet: names of sites or bodies, F.
-        imu: name of the site or body whose axes and origin positions are told in.
-        joints: names of the joints in the order in which angles are given, J; ``None`` for all hinges and slides in
-            the model's order. It may name more joints than the legs have.
+        imu: name of the site or body that is the reference frame of the positions.
+        joints: names of the joints in the order in which angles are given, J; ``None`` for all hinges and slides in the
+            model's order. Joints outside of the legs are allowed.
 
     Attributes:
-        base: the pose of the sensor on the base ``[7]``, a point of ``SE3``: position in the base's axes in m.
+        base: pose of the sensor in the base's frame ``[7]``, a point of ``SE3``, in m.
 
     Raises:
         KeyError: if the model has no such site, body or joint, or ``joints`` lacks one that moves a foot.
@@ -92,7 +91,7 @@ class LegKinematics(nn.Module):
         return self.moving(positions, rates)[1]
 
     def moving(self, positions: Tensor, rates: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns positions and velocities, which take one way along the legs."""
+        """Returns positions and velocities, in one pass."""
         end, jacobian = self._with_jacobian(positions)
         return end, (jacobian * rates[..., self.column].unsqueeze(-1)).sum(-2)
 
@@ -106,7 +105,7 @@ class LegKinematics(nn.Module):
         return end, torch.linalg.cross(axes, lever) + slides
 
     def _along(self, positions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Returns the feet, and of each joint its axis of turn, its direction of slide, and its place."""
+        """Returns the feet, and the rotation axis, slide direction and position of each joint."""
         moved = positions[..., self.column] - self.zero
         length = self.zero.shape[-1]
         turn = self.fixed[:, 0, :4].expand(*moved.shape[:-1], 4)
@@ -168,7 +167,7 @@ def check_names(argument: str, names: Sequence[str]) -> None:
 
 
 def _frame(model: mujoco.MjModel, argument: str, name: str) -> tuple[int, Tensor]:
-    """Returns the body that a site or body belongs to, and its pose there ``[7]``."""
+    """Returns the body of a site or body, and its pose in that body's frame ``[7]``."""
     for kind, number in _OBJECTS.items():
         found = mujoco.mj_name2id(model, number, name)
         if found >= 0 and kind == "site":
@@ -181,7 +180,7 @@ def _frame(model: mujoco.MjModel, argument: str, name: str) -> tuple[int, Tensor
 
 
 def _pose(model: mujoco.MjModel, body: int) -> Tensor:
-    """Returns the pose of a body on its parent, before its joints move it."""
+    """Returns the pose of a body in its parent's frame, at joint positions of zero."""
     return _point(model.body_quat[body], model.body_pos[body])
 
 
@@ -190,7 +189,7 @@ def _point(quaternion, position) -> Tensor:
 
 
 def _moving_joints(model: mujoco.MjModel, body: int) -> list[str]:
-    """Returns the names of a body's joints, a free one left out."""
+    """Returns the names of a body's joints, without free joints."""
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])
     return [model.joint(joint).name for joint in joints if model.jnt_type[joint] != _FREE]

@@ -1,4 +1,4 @@
-"""Learned velocity of each standing foot: a network of the last rows of readings of a legged robot."""
+"""Learned velocity of each stance foot, by a network that reads the last rows of a legged robot's sensors."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _KEYS = ("imu", "joints", "joint_rates", "contact")
 
 
 class LearnedContacts(Sensor):
-    r"""Says of each standing foot how it moves: mean and covariance of its velocity, which should be zero.
+    r"""Predicts mean and covariance of the velocity of each stance foot, which is zero without slip.
 
-    A foot that has just touched the floor slides or bounces for some rows, and on ice it slides longer. Its rate then
-    says little about the base. One small network reads each foot: whether it stood in the last rows, where it was, how
-    fast the base is by this foot and by the mean of all that stand, and what the inertial sensor reads. It gives the
-    mean and a Cholesky factor of the covariance. The filter moves the foot with the mean, and expects of it that rate.
+    A foot slides or bounces for some rows after touch-down, and longer on ice; then it has little information on the
+    base. A small network, shared by the feet, reads the last rows: contact and position of the foot, the velocity of
+    the base by this foot and by the mean of all stance feet, and the inertial sensor. Its outputs are the mean and a
+    Cholesky factor of the covariance. The filter moves the foot with the mean, also in the observation of its rate.
 
-    It is trained by :meth:`loss`, which needs the true velocity of the base, and no filter. What the network has wrong
-    lasts: rows that follow each other err alike. So the filter counts the covariance ``lasts`` times.
+    It is trained by :meth:`loss`, with the true velocity of the base and without a filter. Its errors are correlated in
+    time, so the filter multiplies the covariance by ``lasts``.
 
     Give it to :func:`~torch_denkf.applications.legged.legged_filter` as ``contacts``. An environment gets the last rows
     from :func:`last_rows`, a log from :func:`with_last_rows`.
@@ -44,9 +44,9 @@ class LearnedContacts(Sensor):
         feet: names of sites or bodies, F.
         imu: name of the site or body at which the sensor sits.
         joints: names of the joints in the order of the readings, as for the filter.
-        rows: K, that it reads: this one and some before it.
+        rows: K, number of input rows: the current one and those before it.
         rate: standard deviation of a foot's velocity before training, in m/s.
-        lasts: for how many rows errors last; choose it by validation.
+        lasts: correlation time of the errors in rows; choose it by validation.
         num_cells: hidden layers.
 
     Reads ``("last", "imu")`` ``[*B, 6 K]``, ``("last", "joints")`` and ``("last", "joint_rates")`` ``[*B, J K]`` and
@@ -84,7 +84,7 @@ class LearnedContacts(Sensor):
         self.register_buffer("lasts", torch.tensor(float(lasts)))
 
     def compute(self, imu, joints, rates, contact):
-        """Returns the covariance, the variance with which feet walk, and how they move."""
+        """Returns the covariance, the variance of the feet's random walk, and their mean velocities."""
         mean, cov = self._moments(self.features(imu, joints, rates, contact))
         cov = self.lasts * cov
         feet = torch.eye(cov.shape[-3], dtype=cov.dtype, device=cov.device)
@@ -106,7 +106,7 @@ class LearnedContacts(Sensor):
                 its own axes, in m/s.
 
         Raises:
-            ValueError: if no foot stands in any row, or an entry is of another size or not finite.
+            ValueError: if there is no contact in any row, or an entry is of another size or not finite.
             KeyError: if one is missing.
         """
         cure = "last_rows and with_last_rows make the last rows; the truth is that of a simulator or motion capture."
@@ -131,7 +131,7 @@ class LearnedContacts(Sensor):
     def features(
         self, imu: Tensor, joints: Tensor, rates: Tensor, contact: Tensor, *, rows: int | None = None
     ) -> Tensor:
-        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` in the place of K."""
+        """Returns the network's inputs for each foot, ``[*B, F, 16 K]``; ``rows`` instead of K."""
         rows, kinematics = self.rows if rows is None else rows, self.kinematics
         like = kinematics.base
         sizes = 6, len(kinematics.joints), len(kinematics.joints), len(kinematics.feet)
@@ -152,21 +152,21 @@ class LearnedContacts(Sensor):
 
     @torch.no_grad()
     def standardise(self, log: TensorDictBase) -> None:
-        """Sets mean and scale of what the network reads, by a log with the last rows."""
+        """Sets mean and scale of the network's inputs, from a log with the last rows."""
         features = self.features(*(log["last", key] for key in _KEYS)).flatten(0, -2)
         self.module.loc.copy_(features.mean(0))
         self.module.scale.copy_(features.std(0).clamp(min=1e-3))
 
 
 class Variances(Sensor):
-    """The variances alone that learned contacts say, as analyses of ensembles read them."""
+    """Variances of learned contacts without correlations, for analyses of ensembles."""
 
     def __init__(self, contacts: LearnedContacts):
         super().__init__(contacts, contacts.in_keys, contacts.out_keys)
         self.observation_dim = contacts.observation_dim
 
     def compute(self, *last):
-        """Returns the variances ``[*B, 3 F]``, and how feet walk."""
+        """Returns the variances ``[*B, 3 F]``, and that of the feet's random walk."""
         cov, *others = self.module.compute(*last)
         return cov.diagonal(dim1=-2, dim2=-1), *others
 
@@ -178,7 +178,7 @@ def check_rows(rows: int, every: int) -> None:
 
 
 def last_rows(rows: int, every: int = 1) -> Compose:
-    """Returns a transform of an environment that keeps the last rows of what :class:`LearnedContacts` reads.
+    """Returns a transform of an environment that keeps the last rows of the inputs of :class:`LearnedContacts`.
 
     Args:
         rows: K.
@@ -195,9 +195,9 @@ def _picked(frames: Tensor, rows: int, every: int) -> Tensor:
 
 
 def with_last_rows(log: TensorDictBase, rows: int, every: int = 1) -> TensorDictBase:
-    """Returns a log ``[*B, T]`` with the last rows of what :class:`LearnedContacts` reads.
+    """Returns a log ``[*B, T]`` with the last rows of the inputs of :class:`LearnedContacts`.
 
-    The first row stands for those before it.
+    The first row is repeated for those before it.
 
     Args:
         log: with ``"imu"``, ``"joints"``, ``"joint_rates"`` and ``"contact"``.

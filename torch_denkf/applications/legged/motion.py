@@ -36,9 +36,9 @@ class LeggedSpace(Space):
     A point has 16 + 3 F numbers: orientation (4), velocity in m/s and position in m (3 each), both in the world's axes;
     the gyro's bias in rad/s and the accelerometer's in m/s^2; then each foot's position in m.
 
-    A tangent has 15 + 3 F numbers in the same order. The first three turn the world about its origin: velocity,
-    position and feet turn with the sensor. What the joints say of the feet does not change by that. So a filter that
-    starts with a wrong idea of where up is does not take feet for news of it.
+    A tangent has 15 + 3 F components in the same order. The first three rotate the world about its origin: velocity,
+    position and feet rotate with the sensor. The kinematics of the feet are invariant to that, so a filter with a wrong
+    initial inclination gets no spurious information on it from the feet.
 
     Args:
         feet: F.
@@ -135,20 +135,20 @@ def _matrix_in_order(value: Tensor, rows: int = 9, columns: int = 9) -> Tensor:
 
 
 class LeggedMotion(Motion):
-    r"""Moves the base as its inertial sensor says; a foot that stands stays, one in the air goes where its joints say.
+    r"""Moves the base by its inertial sensor; stance feet stay, swing feet are set to their kinematics.
 
-    A foot in the air is :math:`p + R k`, with the sensor's pose R, p and the foot's place k by the joints. That is the
-    limit of a foot that stays and has boundless process noise, once its reading is taken in; and members of an
-    ensemble, whose feet in the air would show large correlations by chance, keep those that are due.
+    A swing foot is at :math:`p + R k`, with the sensor's pose R, p and the foot's position k by the joints. That is the
+    limit of infinite process noise of the foot, after the update; it avoids large spurious correlations of swing feet
+    in an ensemble.
 
     Args:
         feet: F.
         dt: time step in seconds, or the key of an entry ``[*B, 1]``.
         gravity: in m/s^2.
         imu_key: entry ``[*B, 6]``: gyro in rad/s, accelerometer in m/s^2, in the sensor's axes.
-        feet_key: places of the feet by the joints ``[*B, 3 F]`` in m, in the sensor's axes.
-        contact_key: which of them stand, ``[*B, F]`` bool.
-        moves_key: how fast standing feet move, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` where they rest.
+        feet_key: positions of the feet by the joints ``[*B, 3 F]`` in m, in the sensor's axes.
+        contact_key: contact of each foot, ``[*B, F]`` bool.
+        moves_key: velocities of stance feet, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` for zero.
     """
 
     drift: Tensor
@@ -170,13 +170,13 @@ class LeggedMotion(Motion):
         space: Any = LeggedSpace(feet)  # no Product: the motion uses the space as a whole
         super().__init__(space, dt, actions, ("belief", "ensemble"), ("forecast", "ensemble"))
         self.inertial = InertialMotion(dt, gravity=gravity)
-        # Of errors of orientation, velocity and position: what they change by in a second.
+        # Rates of change of the errors of orientation, velocity and position.
         drift = torch.zeros(9, 9)
         drift[3:6, :3], drift[6:, 3:6] = skew(torch.tensor([0.0, 0.0, -gravity])), torch.eye(3)
         self.register_buffer("drift", drift, persistent=False)
 
     def move(self, state, imu, feet, contact, *moves, dt):
-        """Returns the states one step later."""
+        """Returns the states after one step."""
         base = self.inertial.move(state[..., :16], imu, dt=dt)
         turn, place = base[..., None, :4], base[..., None, 7:10]
         by_joints = place + rotate(turn, feet.unflatten(-1, (-1, 3)))
@@ -199,11 +199,11 @@ class LeggedMotion(Motion):
         return moved, self._assembled(by_biases, turned[..., 2:, :, :].flatten(-3, -2), stands, dt)
 
     def _assembled(self, by_biases: Tensor, feet_by_biases: Tensor, stands: Tensor, dt: Any) -> Tensor:
-        """Returns the Jacobian; the rows of a foot in the air are those of the position.
+        """Returns the Jacobian; the rows of a swing foot are those of the position.
 
         Args:
             by_biases: rows of orientation, velocity and position, columns of the biases, ``[*, 9, 6]``.
-            feet_by_biases: rows of feet that stand, ``[*, 3 F, 6]``.
+            feet_by_biases: rows of stance feet, ``[*, 3 F, 6]``.
             stands: which rows these are, ``[*, 3 F]``.
             dt: seconds, a number or ``[*, 1]``.
         """
@@ -226,7 +226,7 @@ class LeggedMotion(Motion):
 class LeggedMotionNoise(SubModel):
     """Process noise of a step of :class:`LeggedMotion`, given the foot contacts.
 
-    A foot that stands slips a little; one in the air is where its joints say but for their error.
+    Stance feet have the noise of slip, swing feet that of the kinematics.
 
     Args:
         feet: F.
@@ -234,9 +234,9 @@ class LeggedMotionNoise(SubModel):
         noises: of sensors and feet.
         ensemble: whether the belief is an ensemble: it gets variances ``[*B, 15 + 3 F]`` of steps on :attr:`space`, in
             the sensor's axes. A mean and a covariance get a covariance of tangents of :class:`LeggedSpace`.
-        contact_key: which feet stand, ``[*B, F]`` bool.
-        slip_key: variance of a standing foot's velocity, independent in each step, in m^2/s^2, ``[*B, F]``; ``None``
-            for the slip of ``noises``.
+        contact_key: contact of each foot, ``[*B, F]`` bool.
+        slip_key: variance of a stance foot's velocity, independent in each step, in m^2/s^2, ``[*B, F]``; ``None`` for
+            the slip of ``noises``.
     """
 
     base: Tensor
@@ -275,6 +275,6 @@ class LeggedMotionNoise(SubModel):
         var = torch.cat([base, torch.where(contact, slip * dt, self.air).repeat_interleave(3, -1)], -1)
         if mean is None:
             return var
-        # Of a foot all three axes have one variance, so the sensor's serve as well as the world's.
+        # The three axes of a foot have one variance, which is the same in the sensor's axes and the world's.
         to_world = self.world.adjoint(self.world.inverse(mean))
         return to_world @ (var.unsqueeze(-1) * to_world.mT)

@@ -1,4 +1,4 @@
-"""Noise of a legged robot's sensors, and of the velocity of a standing foot."""
+"""Noise of a legged robot's sensors, and of the velocity of a stance foot."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ __all__ = ["LeggedNoises"]
 class LeggedNoises:
     """Noise model of a filter of a legged robot's base.
 
-    The defaults fit :func:`~torch_denkf.applications.legged.quadruped_env` on firm ground, with some room for a worse
-    accelerometer. Feet that slide, or rows that are stamped unevenly, ask for more.
+    The defaults fit :func:`~torch_denkf.applications.legged.quadruped_env` on firm ground, with a margin for a worse
+    accelerometer. Sliding feet or irregular time stamps need more.
 
     Attributes:
-        gyro: density of its white noise, in rad/s/sqrt(Hz).
-        accelerometer: in m/s^2/sqrt(Hz); vibration between two readings is in it.
-        gyro_walk: of the random walk of its bias, in rad/s^2/sqrt(Hz).
-        accelerometer_walk: in m/s^3/sqrt(Hz).
-        slip: how a standing foot walks at random, in m/sqrt(s).
-        kinematics: of a foot's position by the joints, in m.
-        rate: of the velocity of a standing foot by the joints' rates, in m/s.
-        tilt: of the orientation at the start, in rad; the heading starts from zero, and is what it is called.
-        velocity: of the base at the start, in m/s.
-        gyro_bias: at the start, in rad/s.
-        accelerometer_bias: at the start, in m/s^2.
+        gyro: density of the gyro's white noise, in rad/s/sqrt(Hz).
+        accelerometer: that of the accelerometer, in m/s^2/sqrt(Hz), with vibration between two readings.
+        gyro_walk: random walk of the gyro's bias, in rad/s^2/sqrt(Hz).
+        accelerometer_walk: that of the accelerometer's bias, in m/s^3/sqrt(Hz).
+        slip: random walk of a stance foot, in m/sqrt(s).
+        kinematics: error of a foot's position by the joints, in m.
+        rate: error of a stance foot's velocity by the joint rates, in m/s.
+        tilt: initial error of the inclination, in rad; the initial heading is zero by definition.
+        velocity: initial error of the base's velocity, in m/s.
+        gyro_bias: initial error of the gyro's bias, in rad/s.
+        accelerometer_bias: initial error of the accelerometer's bias, in m/s^2.
 
     Raises:
         ValueError: if a number is negative.

@@ -1,4 +1,4 @@
-"""dm_control's quadruped, how it trots, and its filter with trained contacts."""
+"""dm_control's quadruped, its trot, and its filter with learned contacts."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def quadruped_env(
     pushes: float = 0.0,
     seed: int = 0,
 ) -> LeggedEnv:
-    """Returns dm_control's quadruped on a floor, with an inertial sensor next to its middle, 100 steps a second.
+    """Returns dm_control's quadruped on a floor, with an inertial sensor next to its middle, 100 steps per second.
 
     Args:
         errors: of the sensors.
-        friction: of feet and floor: the force along the floor by the force upon it. On 0.3 feet slide.
-        softness: seconds in which the floor gives way and comes back.
+        friction: friction coefficient of feet and floor. With 0.3, feet slide.
+        softness: time constant of the contact, in s.
         pushes: standard deviation in N, see :class:`LeggedEnv`. The robot has 107 kg.
         seed: of errors and pushes.
     """
@@ -54,14 +54,14 @@ def quadruped_env(
 def trot(
     time: float, *, pace: float = 1.0, stride: float = 0.3, height: float = 0.3, turn: float = 0.0
 ) -> torch.Tensor:
-    """Controls ``[12]`` of dm_control's quadruped that let it trot: two legs swing while the other two stand.
+    """Returns controls ``[12]`` of dm_control's quadruped for a trot: diagonal legs swing in turn.
 
     Args:
         time: in s.
-        pace: strides a second.
+        pace: strides per second.
         stride: amplitude of the hips.
-        height: by how much legs are lifted.
-        turn: by how much the strides of right and left legs differ, -1 to 1.
+        height: lift of the legs.
+        turn: relative difference of right and left strides, -1 to 1.
     """
     for name, value in {"time": time, "pace": pace, "stride": stride, "height": height, "turn": turn}.items():
         check_number(name, value)
@@ -83,10 +83,10 @@ def quadruped(
 ) -> Filter:
     """Returns an untrained filter of dm_control's quadruped, with :class:`LearnedContacts`.
 
-    ``from_pretrained("quadruped")`` is this filter, trained. It reads what ``last_rows(10, every=5)`` keeps.
+    ``from_pretrained("quadruped")`` is this filter, trained. It reads the rows of ``last_rows(10, every=5)``.
 
     Args:
-        rows: K, that the contacts read.
+        rows: K, number of input rows of the contacts.
         num_cells: hidden layers of their networks.
         dt: time step in seconds.
         kind: the belief.

@@ -17,20 +17,20 @@ __all__ = ["FeetInBody", "FeetRates", "LegReadings"]
 
 
 class LegReadings(SubModel):
-    """Writes what the filter reads of the joints, and the state in which a robot starts that stands still.
+    """Writes the filter's observations from the joints, and the initial state of a robot at rest.
 
-    That state is upright as the accelerometer says, at the origin, with heading zero; where the accelerometer says
-    nothing, as in a row that is rejected, the base's own z points up.
+    That state has the inclination by the accelerometer, position zero and heading zero; without an accelerometer
+    reading, as in a rejected row, the base's z points up.
 
     Args:
         kinematics: of the robot's legs.
-        dt: time step in seconds, or the key of an entry ``[*B, 1]``, which is looked at here: above zero.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``, positive, which is checked here.
         imu_key: entry ``[*B, 6]``: gyro in rad/s, accelerometer in m/s^2, in the sensor's axes.
         joints_key: angles ``[*B, J]`` in rad.
-        rates_key: their rates ``[*B, J]`` in rad/s; ``None`` where nothing reads them.
-        contact_key: which feet stand, ``[*B, F]`` bool.
-        prefix: of what is written: ``feet`` ``[*B, 3 F]`` in m, ``observed`` ``[*B, 3 F]`` bool, ``start``
-            ``[*B, 16 + 3 F]``, and ``rates`` ``[*B, 3 F]`` in m/s if there is ``rates_key``.
+        rates_key: joint rates ``[*B, J]`` in rad/s; ``None`` for no such sensor.
+        contact_key: contact of each foot, ``[*B, F]`` bool.
+        prefix: prefix of the outputs: ``feet`` ``[*B, 3 F]`` in m, ``observed`` ``[*B, 3 F]`` bool, ``start`` ``[*B, 16
+            + 3 F]``, and ``rates`` ``[*B, 3 F]`` in m/s if there is ``rates_key``.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class LegReadings(SubModel):
         super().__init__(kinematics, in_keys, [(prefix, name) for name in names])
 
     def compute(self, imu, joints, contact, *others):
-        """Returns the feet, which of them stand, the start, and the feet's rates."""
+        """Returns the feet, their contacts, the initial state, and the feet's velocities."""
         kinematics, values = self.module, (imu, joints, contact, *others)
         sizes = [6, len(kinematics.joints), len(kinematics.feet), *[1] * len(self.steps), len(kinematics.joints)]
         for key, size, value in zip(self.in_keys, sizes, values, strict=False):
@@ -113,14 +113,14 @@ class FeetInBody(SubModel):
 
 
 class FeetRates(SubModel):
-    r"""Observes standing feet's velocities in sensor axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
+    r"""Observes velocities of stance feet in sensor axes, :math:`-R^\top v - (\omega - b) \times R^\top (f_i - p)`.
 
-    It is told by the joints' rates, and says the base's velocity at once.
+    The readings follow from the joint rates, and determine the base's velocity.
 
     Args:
         space: of the states, :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
         imu_key: entry ``[*B, 6]``, of which the gyro is read, in rad/s.
-        moves_key: how fast standing feet move, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` where they rest.
+        moves_key: velocities of stance feet, ``[*B, 3 F]`` in m/s, in the sensor's axes; ``None`` for zero.
         in_key: states to observe ``[*B, E, P]``.
         out_key: predicted readings ``[*B, E, 3 F]`` in m/s.
     """

@@ -1,4 +1,4 @@
-"""The velocity of a robot's base in its own axes, of a belief about its inertial sensor."""
+"""Body velocity of a robot's base, from the belief about its inertial sensor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def base_velocity(state: Tensor, gyro: Tensor, sensor: Tensor) -> Tensor:
 
     Args:
         state: of the sensor ``[*, 16 + 3 F]``, see :class:`~torch_denkf.applications.legged.motion.LeggedSpace`.
-        gyro: what it reads, in rad/s, ``[*, 3]``.
+        gyro: reading in rad/s, ``[*, 3]``.
         sensor: the sensor's pose S, r on the base ``[7]``.
 
     Returns:
@@ -41,7 +41,7 @@ def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Te
         sensor: ``[7]``.
     """
     axes = rotation_matrix(sensor[:4])
-    seen = axes @ rotation_matrix(mean[..., :4]).mT  # the velocity turns with the orientation, so none comes by that
+    seen = axes @ rotation_matrix(mean[..., :4]).mT  # rotating the world leaves the body velocity as it is
     part = torch.cat([seen, (-skew(sensor[4:]) @ axes).expand_as(seen)], -1)  # by velocity, gyro's bias
     rows = torch.cat([cov[..., 3:6, :], cov[..., 9:12, :]], -2)
     var = (part @ torch.cat([rows[..., 3:6], rows[..., 9:12]], -1) * part).sum(-1)
@@ -51,14 +51,13 @@ def base_velocity_of_moments(mean: Tensor, cov: Tensor, gyro: Tensor, sensor: Te
 class BaseVelocity(SubModel):
     """Writes ``("belief", "velocity")`` and ``("belief", "velocity_var")``, ``[*B, 3]``: the base's, in its own axes.
 
-    The velocity of the base is the sensor's, less what the base's turn adds between both: what the gyro reads in that
-    moment counts, too.
+    The velocity of the base is the sensor's, minus the lever-arm term of the base's rotation, which the gyro reads.
 
     Args:
         sensor: the sensor's pose on the base, ``[7]``.
-        gyro_std: of the gyro's white noise in one reading, in rad/s.
+        gyro_std: standard deviation of the gyro's white noise in one reading, in rad/s.
         ensemble: whether the belief is an ensemble, or a mean and a covariance.
-        imu_key: entry ``[*B, 6]``, of which the gyro is read.
+        imu_key: entry ``[*B, 6]``; its first half is the gyro.
     """
 
     sensor: Tensor
@@ -81,7 +80,7 @@ class BaseVelocity(SubModel):
         return velocity, var + self.jitter
 
     def derived(self, carried: Entries) -> Entries:
-        """Returns both of a given belief: as the gyro turns, where the entries hold its reading; else at rest."""
+        """Returns velocity and variances of a given belief, with the gyro's reading if there is one, else at rest."""
         belief = [carried[key] for key in self.in_keys[1:]]
         bias = belief[0][..., 10:13]
         still = bias.mean(-2) if len(belief) == 1 else bias
@@ -89,7 +88,7 @@ class BaseVelocity(SubModel):
 
 
 class StartEnsemble(AroundState):
-    """Members around where a robot starts that stands still, with the base's velocity next to them.
+    """Initial ensemble around the start pose of a robot at rest, and the base's velocity.
 
     Args:
         std: standard deviations of tangents, as of :class:`AroundState`.
@@ -101,7 +100,7 @@ class StartEnsemble(AroundState):
     def __init__(self, std, velocity_std, velocity, **options):
         keys = [("belief", name) for name in ("ensemble", "mean", "var")]
         super().__init__(std, out_keys=[*keys, *_KEYS], **options)
-        self.velocity_std, self._velocity = velocity_std, (velocity,)  # in a tuple: it is a module of the filter's
+        self.velocity_std, self._velocity = velocity_std, (velocity,)  # a tuple hides the module
 
     def compute(self, state, *, noise, batch_size):
         """Returns the belief, and the velocity."""
@@ -109,12 +108,12 @@ class StartEnsemble(AroundState):
         return ensemble, mean, var, *_still(mean, self.velocity_std)
 
     def derived(self, carried):
-        """Returns the velocity of a belief that is given."""
+        """Returns the velocity of a given belief."""
         return self._velocity[0].derived(carried)
 
 
 class StartMoments(GaussianAround):
-    """A mean and a covariance around where a robot starts that stands still, with the base's velocity next to them.
+    """Initial mean and covariance around the start pose of a robot at rest, and the base's velocity.
 
     Args:
         std: standard deviations of tangents, as of :class:`GaussianAround`.
@@ -135,7 +134,7 @@ class StartMoments(GaussianAround):
         return mean, cov, var, *_still(mean, self.velocity_std)
 
     def derived(self, carried):
-        """Returns the velocity of a belief that is given."""
+        """Returns the velocity of a given belief."""
         return self._velocity[0].derived(carried)
 
 

@@ -37,10 +37,10 @@ class NoisyEncoders(Transform):
 
 
 def reacher_env(seed: int = 0) -> TransformedEnv:
-    """Returns a reacher with a noisy ``"encoder"`` (0.05 rad); ``"state"`` is the truth, for training and scores.
+    """Returns a reacher with a noisy ``"encoder"`` (0.05 rad); ``"state"`` is the true state, for training and tests.
 
     Args:
-        seed: of the environment; the noise follows torch's generator.
+        seed: of the environment; the noise uses torch's generator.
 
     Example:
         >>> sorted(reacher_env().rollout(2)["state"].shape)

@@ -13,14 +13,14 @@ __all__ = ["ReacherFilter", "ReacherSettings", "reacher"]
 
 @dataclass(frozen=True)
 class ReacherSettings:
-    """All numbers that a :class:`ReacherFilter` is built from.
+    """Settings of a :class:`ReacherFilter`.
 
     Attributes:
         encoder_std: standard deviation of the encoders' noise, in rad.
         state_mean: mean of [q1 rad, q2 rad, w1 rad/s, w2 rad/s] over the training episodes.
-        state_std: standard deviation of them.
+        state_std: standard deviation, likewise.
         num_cells: hidden layers of the transition.
-        ensemble_size: members, E.
+        ensemble_size: number of members, E.
     """
 
     encoder_std: float = 0.05
@@ -36,8 +36,8 @@ class ReacherSettings:
 class ReacherFilter(DEnKF):
     """A DEnKF for the two joints of dm_control's reacher, built by :func:`reacher`.
 
-    It reads ``"encoder"`` ``[*B, 2]``, the joints' angles in rad with noise, and ``"action"`` ``[*B, 2]``. The state is
-    [q1 rad, q2 rad, w1 rad/s, w2 rad/s]; its dynamics are learned.
+    It reads ``"encoder"`` ``[*B, 2]``, noisy joint angles in rad, and ``"action"`` ``[*B, 2]``. The state is [q1 rad,
+    q2 rad, w1 rad/s, w2 rad/s]; its dynamics are learned.
 
     Args:
         settings: sizes and constants.

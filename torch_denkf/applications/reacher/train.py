@@ -30,10 +30,10 @@ def train_reacher(
     Args:
         out: folder of the filter, with its logs below ``training``.
         seed: of all random numbers.
-        updates: of the transition.
-        episodes: of 200 steps to train on.
-        command: how this was called, for the record.
-        progress: whether bars say how far it is.
+        updates: number of updates of the transition.
+        episodes: number of training episodes of 200 steps.
+        command: command line, as a record.
+        progress: whether to show progress bars.
     """
     torch.manual_seed(seed)
     env = reacher_env(seed)
@@ -63,11 +63,11 @@ def train_reacher(
 
 @torch.no_grad()
 def evaluate_reacher(model: ReacherFilter, *, episodes: int = 10, steps: int = 400, seed: int = 1000) -> dict[str, Any]:
-    """Returns errors over episodes that the training has not seen.
+    """Returns errors on held-out episodes.
 
     Returns:
         Root mean square errors in rad and rad/s of the filter, of the encoders, their differences, and the mean of the
-        last eleven differences; and the share of the truth in the filter's 90 % intervals.
+        last eleven differences; and the coverage of the filter's 90 % intervals.
     """
     torch.manual_seed(seed)
     env = reacher_env(seed)

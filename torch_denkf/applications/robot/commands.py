@@ -21,7 +21,7 @@ __all__ = ["Fuse"]
 
 @dataclass
 class Fuse(Command):
-    """Filter and smooth a log; say of each sensor how far it is believed; learn the noises; write path and settings."""
+    """Filter and smooth a log; report the accepted share of each sensor; learn the noises; write path and settings."""
 
     log: tyro.conf.Positional[tuple[Path, ...]]  # text, Parquet, or ROS bags, of one clock
     out: Path  # folder for path.csv, path.tum, path.geojson, path.png, bands.png, report.md and ekf.yaml

@@ -160,7 +160,7 @@ def read_config(config: Mapping[str, Any] | str | Path) -> Config:
 
 
 def write_config(config: Config, path: Path, changed: Mapping[str, Any]) -> None:
-    """Writes the parameters as they were given, but for some, for robot_localization to read.
+    """Writes the parameters as they were given, except for some, for robot_localization to read.
 
     Raises:
         ImportError: without PyYAML.
@@ -218,7 +218,7 @@ def _matrix(name: str, values: Any) -> np.ndarray:
 
 
 def _numbers_of(yaml: Any) -> Any:
-    """A loader that reads 1e-3, which YAML 1.1 takes for text, as a number, as ROS does."""
+    """Returns a loader that reads 1e-3, which YAML 1.1 takes for text, as a number, as ROS does."""
     loader: Any = type("Loader", (yaml.SafeLoader,), {})
     pattern = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
     loader.add_implicit_resolver("tag:yaml.org,2002:float", pattern, list("-+0123456789."))

@@ -55,7 +55,7 @@ def learn_noises(
 ) -> Learned:
     """Learns how large noises and drifts are, so that the fixes of a log are likely where they are hidden.
 
-    The likelihood of each next reading says little of errors that last. So the log is cut into segments of three
+    The likelihood of each next reading tells little about coloured noise. So the log is cut into segments of three
     windows, each from the filter's belief at that time; fixes of the middle window are hidden, and are to be likely for
     the smoother, with the fix's own noise and drift. A log without fixes is learned by the likelihood of its readings.
     White noise starts from how much readings differ from the line through their neighbours, the drift of fixes from
@@ -169,7 +169,7 @@ def _alike(gradient: Tensor, at: Sequence[int]) -> Tensor:
 
 
 def scale_of(model: RobotModel, name: str) -> Tensor:
-    """The parameter of a sensor's noise."""
+    """Returns the parameter of a sensor's noise."""
     return model.filter[f"{name}_noise"].module.log_scale
 
 
@@ -180,7 +180,7 @@ def _varies(model: RobotModel, rows: TensorDict, name: str) -> Tensor:
 
 
 def _start_from(model: RobotModel, rows: TensorDict, name: str, varies: Tensor) -> None:
-    """Sets white noise to what readings differ from the line through their neighbours."""
+    """Sets white noise to the residuals of readings from the line through their neighbours."""
     there = rows[f"{name}_observed"][:, 0]
     seen, given = rows[name][there], rows[f"{name}_noise"][there].diagonal(dim1=-2, dim2=-1).mean(0).sqrt()
     if len(seen) < 3 * _HELD_OUT or model.drifts is None:
@@ -230,7 +230,7 @@ def _segments(model: RobotModel, rows: TensorDict, window: float, length: int) -
 
 
 def _positions(model: RobotModel) -> list[str]:
-    """The sensors that read x and y first."""
+    """Returns the sensors that read x and y first."""
     return [name for name, reads in model.reads.items() if tuple(reads[:2]) == (0, 1)]
 
 

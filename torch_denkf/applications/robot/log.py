@@ -62,7 +62,7 @@ def log_streams(*files: Path) -> dict[str, Stream]:
 
 
 def default_settings(streams: Mapping[str, Stream]) -> dict:
-    """Settings for a log without any: in the plane, all sensors that a stream's columns tell.
+    """Returns settings for a log without any: in the plane, all sensors that a stream's columns tell.
 
     Raises:
         ValueError: if they tell none.
@@ -222,7 +222,7 @@ def _rate(seen: Seen) -> float:
 
 
 def start_of(log: RobotLog, model: RobotModel) -> RobotModel:
-    """The model that starts where the first readings say: place, heading, speed."""
+    """Returns the model that starts where the first readings say: place, heading, speed."""
     mean, cov = model.config.initial_state.copy(), model.config.initial_cov.copy()
     if "initial_state" in model.config.given:
         return model

@@ -24,7 +24,7 @@ PLANE_VARIANCE = 1e-6  # of the zeros that are read in the plane
 
 @dataclass(frozen=True)
 class RobotModel:
-    """A filter, and what it reads.
+    """A filter and its inputs.
 
     Attributes:
         filter: of the fifteen states; its rows have ``"dt"``, and for each sensor its readings, their mask and their
@@ -89,7 +89,7 @@ def _initial(mean: Tensor, cov: Tensor, drifts: Drifts | None) -> MomentPrior:
 
 
 class LearnedScale(SubModel):
-    """The covariances that messages bring, with standard deviations scaled by what is learned.
+    """Covariances of the messages, with learned factors on the standard deviations.
 
     Args:
         in_key: covariances of the data ``[*B, O, O]``.
@@ -104,7 +104,7 @@ class LearnedScale(SubModel):
         self.log_scale = nn.Parameter(torch.zeros(size - kept, dtype=dtype))
 
     def compute(self, covariance):
-        """The scaled covariances."""
+        """Returns the scaled covariances."""
         scale = nn.functional.pad(self.log_scale, (0, self.kept)).exp().to(covariance.dtype)
         return covariance * scale * scale.unsqueeze(-1)
 
@@ -118,14 +118,14 @@ def robot_model(
     """Makes the filter that a configuration of robot_localization describes.
 
     Messages of an odometry are two sensors, its pose and its twist, and those of an inertial sensor three; each is
-    believed by the covariance that stands in its row, and by its drifts. With ``two_d_mode`` each reads also zeros, of
+    weighted by the covariance in its row, and by its drifts. With ``two_d_mode`` each reads also zeros, of
     variance 1e-6, of what does not move in the plane. Poses of ``..._differential`` and ``..._relative`` sensors are
     those of the rows.
 
     Args:
         config: a YAML file, or its content. Four parameters of a sensor are this library's own: ``odom0_delay``, in s;
             ``odom0_variances``, fifteen, where messages bring no covariance; ``odom0_drifts``, fifteen standard
-            deviations of errors that last (that of a forward speed is a share of it), and ``odom0_drift_time``, in s, a
+            deviations of coloured noise (that of a forward speed is a share of it), and ``odom0_drift_time``, in s, a
             number or fifteen.
         kind: the extended filter, or the unscented one, with ``alpha``, ``kappa`` and ``beta`` of the configuration.
         dtype: of all constants; float64, in which robot_localization calculates.

@@ -89,7 +89,7 @@ class RobotMotion(Motion):
         self.drifts, self.held = drifts, held
 
     def move(self, state, *, dt):
-        """The pose moved by velocity and acceleration, the velocity by the acceleration."""
+        """Returns the pose moved by velocity and acceleration, the velocity by the acceleration."""
         return self._moved(state, dt)[0]
 
     def move_and_gradient(self, state, *, dt):
@@ -120,7 +120,7 @@ class RobotMotion(Motion):
         return moved, out
 
     def _moved(self, state, dt):
-        """The states later, the way, the body's axes in the world, the angles' rates by turn rates, and the yaw."""
+        """Returns later states, distance travelled, body axes in the world, angle rates from turn rates, and yaw."""
         place, angles, velocity, rates, force, slow = state.split([3, 3, 3, 3, 3, state.shape[-1] - 15], -1)
         (sr, sp), (cr, cp) = angles[..., :2].sin().unbind(-1), angles[..., :2].cos().unbind(-1)
         one, zero = torch.ones_like(sr), torch.zeros_like(sr)
@@ -148,7 +148,7 @@ class RobotMotion(Motion):
 
 
 class RobotNoise(SubModel):
-    """Process noise of the fifteen states, a covariance for each second, scaled by what is learned, and of drifts.
+    """Process noise of the fifteen states, a covariance per second with learned factors, and that of drifts.
 
     Args:
         cov: of a second, ``[15, 15]``.
@@ -175,7 +175,7 @@ class RobotNoise(SubModel):
         self.log_scale = nn.Parameter(torch.zeros(len(STATES), dtype=cov.dtype))
 
     def compute(self, mean, *dt):
-        """The covariance of the step."""
+        """Returns the covariance of the step."""
         scale = self.log_scale.exp()
         cov = (self.cov * scale * scale.unsqueeze(-1)).to(mean.dtype)
         if self.dynamic:

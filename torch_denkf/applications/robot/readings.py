@@ -42,7 +42,7 @@ class Seen(NamedTuple):
     stated: bool
 
     def every(self, count: int) -> Seen:
-        """Each of so many readings; all for a count of one or less."""
+        """Returns each of so many readings; all for a count of one or less."""
         kept = slice(None, None, max(count, 1))
         return Seen(self.times[kept], self.values[kept], self.noise[kept], self.stated)
 
@@ -73,7 +73,7 @@ def unread(columns: Sequence[str], places: Collection[int]) -> list[str]:
 def seen_by(
     sensor: SensorConfig, group: str, config: Config, table: Readings, origin: Sequence[float] | None, scale: float
 ) -> Seen:
-    """Finds what a sensor reads of the states.
+    """Extracts a sensor's readings of state components from a log.
 
     Args:
         sensor: its settings.
@@ -129,7 +129,7 @@ def seen_by(
 
 
 def _states(table: Readings, origin: Sequence[float] | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """The states of each row ``[n, 15]``, and their covariances ``[n, 15, 15]``; NaN where they are not known."""
+    """Returns the states of each row ``[n, 15]`` and their covariances ``[n, 15, 15]``; NaN if unknown."""
     count, columns = (
         len(table.times),
         dict(zip(table.columns, table.values.T, strict=True)),
@@ -207,7 +207,7 @@ def _gravity(angles: np.ndarray, gravity: float) -> np.ndarray:
 
 
 def _differences(times: np.ndarray, values: np.ndarray, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Velocities in the body's axes, and turn rates, of poses that follow each other."""
+    """Returns velocities and turn rates in the body's axes, from consecutive poses."""
     step = np.diff(times)[:, None]
     speed, out = np.diff(values[:, :3], axis=0) / step, np.full((len(step), 15), np.nan)
     middle = np.nan_to_num(values[:-1, 5]) + 0.5 * _wrapped(np.nan_to_num(np.diff(values[:, 5])))

@@ -26,18 +26,9 @@ _BELIEVED = 0.99  # of a reading's distance: beyond, it is none that the noise e
 
 
 def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]:
-    """Says of each sensor its outliers, how often it is believed, its bias, noise, drift and delay, as a table."""
-    heads = (
-        "sensor",
-        "reads",
-        "readings",
-        "outliers",
-        "believed",
-        "bias",
-        "residual",
-        "noise as given",
-        "noise as learned",
-    )
+    """Returns a table of each sensor's outliers, share of accepted readings, bias, delay, noise and drift."""
+    heads = ["sensor", "reads", "readings", "outliers", "accepted", "bias", "residual"]
+    heads += ["noise as given", "noise as learned"]
     lines = [f"| {' | '.join(heads)} | drift | offset |", "|" + "---|" * (len(heads) + 2)]
     for sensor in model.config.sensors:
         for group in sensor.groups:
@@ -72,7 +63,7 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
 
 
 def _drift(model: RobotModel, name: str, at: int) -> tuple[float, float] | None:
-    """Standard deviation and time, s, of the drift of a sensor's reading; ``None`` for one that has none."""
+    """Returns standard deviation and time constant (s) of a sensor's drift; ``None`` for a sensor without drift."""
     place = model.reading(name).slow[at]
     if place is None or model.drifts is None:
         return None
@@ -81,7 +72,7 @@ def _drift(model: RobotModel, name: str, at: int) -> tuple[float, float] | None:
 
 
 def _chi_square(dof: int) -> float:
-    """The quantile of a chi-square distribution, by Wilson and Hilferty."""
+    """Returns the quantile of a chi-square distribution, by Wilson and Hilferty."""
     part = 2 / (9 * dof)
     return dof * (1 - part + NormalDist().inv_cdf(_BELIEVED) * math.sqrt(part)) ** 3
 
@@ -105,7 +96,7 @@ def gap_errors(out: TensorDict, full: TensorDict, model: RobotModel) -> tuple[fl
 
 
 def learned_settings(model: RobotModel, log: RobotLog, rows: TensorDict) -> dict[str, Any]:
-    """The settings that were learned: process noise, and delays, variances and drifts of the sensors."""
+    """Returns the settings that were learned: process noise, and delays, variances and drifts of the sensors."""
     process = next(part for part in model.filter.modules() if hasattr(part, "log_scale") and hasattr(part, "dynamic"))
     scale = process.log_scale.detach().exp()
     cov: Tensor = process.cov * scale * scale.unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""The filter of the UR5 table: joints, gripper and tool from one camera's pictures and the joints' targets."""
+"""The filter of the UR5 table: joints, gripper and tool from one camera's images and the joints' targets."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ _STEP = 0.05  # rad: a usual way of a joint in a step
 
 @dataclass(frozen=True)
 class UR5TableSettings:
-    """All numbers that a :class:`UR5TableFilter` is built from.
+    """Settings of a :class:`UR5TableFilter`.
 
     Attributes:
-        pixels: side of the pictures.
+        pixels: height and width of the images.
         state_mean: mean of the state over the training demos, ``[10]``.
         state_std: standard deviation of the state over them, ``[10]``.
         pixel_mean: mean of red, green and blue over them, in [0, 1].
         pixel_std: standard deviation of them.
         sensor_std: error of the sensor before the filter is trained, ``[10]``.
         channels: of the sensor's convolutions.
-        keypoints: channels whose places are read.
+        keypoints: number of channels of the spatial soft-argmax.
         features: width of the trunk's output.
         pooled: rows and columns of the coarse view.
         num_cells: hidden layers of the sensor's head and of the transition.
-        ensemble_size: members, E.
+        ensemble_size: number of members, E.
         inflation: factor on the belief's spread in each step, chosen on validation demos.
         threshold: of localisation by significance, in standard deviations; ``None`` for none.
     """
@@ -108,7 +108,7 @@ class UR5TableFilter(DEnKF):
 
     @property
     def settings(self) -> UR5TableSettings:
-        """Returns all numbers that it is built from, with the inflation as it is now."""
+        """Returns the settings, with the current inflation."""
         return replace(self._settings, inflation=self.inflation)
 
     @property
@@ -122,7 +122,7 @@ class UR5TableFilter(DEnKF):
 
 
 class _ArmTransition(LearnedTransition):
-    """Reads how far each joint is from its target, in the place of the target itself."""
+    """Transition with each joint's distance to its target as input, instead of the target."""
 
     def __init__(self, settings: UR5TableSettings):
         s = settings
@@ -136,7 +136,7 @@ class _ArmTransition(LearnedTransition):
         self.register_buffer("change", torch.tensor(scale))
 
     def compute(self, state, action=None, dt=None, *, noise):
-        """Returns the forecast ensemble: each joint on its way to its target, and what the network adds to that."""
+        """Returns the forecast ensemble: joints approach their targets, plus the network's output."""
         way = action.to(state.dtype).unsqueeze(-2) - state[..., :JOINTS]
         features = torch.cat([(state - self.loc) / self.scale, (way / _STEP).clamp(-4, 4)], -1)
         return state + self.change * self._run(features, noise)

@@ -44,7 +44,7 @@ def train_ur5_table(
     command: str = "",
     progress: bool = True,
 ) -> UR5TableFilter:
-    """Collects what is missing, trains the filter and writes it to a folder; a repeated call goes on.
+    """Collects missing demos, trains the filter and writes it to a folder; a repeated call continues.
 
     Demos below ``sequences`` are the filter's, so that it sees how wrong its sensor is on new ones; the others are the
     sensor's. The replay's hash decides which demos are for tests; those are in neither.
@@ -159,7 +159,7 @@ def _train_sensor(
 
 @torch.no_grad()
 def read_demos(model: UR5TableFilter, demos: TensorDict, seed: int = 0) -> TensorDict:
-    """Runs the sensor on whole demos ``[N, T]``: samples and encodings in the place of the pixels."""
+    """Runs the sensor on whole demos ``[N, T]``: samples and encodings instead of the pixels."""
     parts = []
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -1,13 +1,13 @@
-"""LeRobot's layout on disk, versions 2.0, 2.1 and 3.0: which file holds what, and the numbers in them.
+"""Reads LeRobot's layout on disk, versions 2.0, 2.1 and 3.0: metadata, tables, and paths of videos and images.
 
 ::
 
     meta/info.json                                      version, fps, features, the two templates of paths
     meta/episodes.jsonl                                 2.x: number and length of each episode
-    meta/episodes/chunk-CCC/file-FFF.parquet            3.0: also the files it is in, and where in the video it begins
-    data/chunk-CCC/episode_EEEEEE.parquet               2.x: numbers (and images); 3.0: file-FFF.parquet, many episodes
+    meta/episodes/chunk-CCC/file-FFF.parquet            3.0: also the episode's files, and its start in the video
+    data/chunk-CCC/episode_EEEEEE.parquet               2.x: tables (and images); 3.0: file-FFF.parquet, many episodes
     videos/chunk-CCC/CAMERA/episode_EEEEEE.mp4          2.x; 3.0: videos/CAMERA/chunk-CCC/file-FFF.mp4
-    images/CAMERA/episode_EEEEEE/frame_FFFFFF.png       where images are neither in videos nor in the parquet files
+    images/CAMERA/episode_EEEEEE/frame_FFFFFF.png       if images are neither in videos nor in the parquet files
 
 Source: github.com/huggingface/lerobot, ``lerobot.datasets``.
 """
@@ -40,11 +40,11 @@ class EpisodeFiles:
     """Files of one episode.
 
     Attributes:
-        number: of the episode.
-        length: rows.
+        number: number of the episode.
+        length: number of rows.
         data: the parquet file.
-        video: the camera's, None where it has images.
-        begin: s into the video.
+        video: video of the camera, None if it has images.
+        begin: start of the episode in the video, s.
     """
 
     number: int
@@ -60,12 +60,12 @@ class Layout:
 
     Attributes:
         root: the folder.
-        fps: rows a second.
-        features: of ``info.json``: dtype, shape and names by key.
+        fps: rows per second.
+        features: features of ``info.json``: dtype, shape and names by key.
         camera: key of the camera.
-        episodes: by number.
+        episodes: files of the episodes, sorted by number.
         empty: episodes without rows.
-        meta: the files that all this is from.
+        meta: files with the metadata.
     """
 
     root: Path
@@ -77,7 +77,7 @@ class Layout:
     meta: tuple[Path, ...]
 
     def width(self, key: str) -> int:
-        """Numbers in a feature.
+        """Returns the number of components of a feature.
 
         Raises:
             ValueError: if there is no such feature, or it is no vector.
@@ -92,7 +92,7 @@ class Layout:
         return int(width)
 
     def names(self, key: str) -> tuple[str, ...] | None:
-        """Names of a feature's numbers, where each has one: lists, lists in lists, or lists below a common name."""
+        """Returns the names of a feature's components from lists, nested lists, or lists under a common name."""
         names = self.features[key].get("names")
         if isinstance(names, dict):
             names = list(names.values())
@@ -113,9 +113,8 @@ def read_layout(root: Path, camera: str | None, chosen: Sequence[int] | None = N
 
     Raises:
         FileNotFoundError: without metadata.
-        ValueError: for versions that are not supported, cameras and episodes that are not there, malformed metadata,
-            numbers out of range, episodes that are listed twice, totals of others than are listed, and paths that lead
-            out of the folder.
+        ValueError: for unsupported versions, unknown cameras and episodes, malformed metadata, numbers out of range,
+            episodes that are listed twice, totals that contradict the list, and paths that lead out of the folder.
     """
     file = root / "meta" / "info.json"
     if not file.is_file():
@@ -125,7 +124,7 @@ def read_layout(root: Path, camera: str | None, chosen: Sequence[int] | None = N
         version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is malformed ({type(error).__name__}: {error}); download it again") from error
-    check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows a second")
+    check_number(f"fps in {file}", fps, above=0, cure="It is the number of rows per second")
     _check_features(file, features)
     if not isinstance(version, str) or version not in VERSIONS:
         raise ValueError(f"{file} is of LeRobot's version {version!r}; this reader knows {', '.join(VERSIONS)}")
@@ -178,7 +177,7 @@ def _some(numbers: Sequence[int]) -> str:
 
 
 def check_files(layout: Layout) -> None:
-    """Looks for the files of all episodes before one of them is read, which may take hours.
+    """Checks that the files of all episodes exist, before hours of reading.
 
     Raises:
         FileNotFoundError: if files are missing; the message says how many, and which episodes are there.
@@ -199,10 +198,10 @@ def check_files(layout: Layout) -> None:
 
 
 def check_empty(layout: Layout) -> None:
-    """Makes sure that episodes of no rows have none.
+    """Checks that episodes of length 0 have no rows.
 
     Raises:
-        ValueError: if there are rows; names the file and the episode.
+        ValueError: if there are rows; the message names the file and the episode.
     """
     for episode in layout.empty:
         if episode.data.is_file():
@@ -316,10 +315,10 @@ def _whole(value: Any) -> int:
 
 
 def _inside(root: Path, info: dict, name: str, **place: Any) -> Path:
-    """Returns a file that a template of ``info.json`` names.
+    """Returns the path that a template of ``info.json`` gives.
 
     Raises:
-        ValueError: if there is no such template, it is none of LeRobot's, or it leads out of the folder.
+        ValueError: if there is no such template, it has unknown fields, or it leads out of the folder.
     """
     file, template = root / "meta" / "info.json", info.get(name)
     if not isinstance(template, str):
@@ -356,7 +355,7 @@ def rows_of_episode(table, episode: EpisodeFiles):
     """Returns the rows of one episode.
 
     Raises:
-        ValueError: if they are not as many as the metadata says, or not in order.
+        ValueError: if their number differs from the metadata, or they are not in order.
     """
     import pyarrow.compute as compute
 
@@ -400,10 +399,10 @@ def vectors(table, file: Path, key: str, width: int) -> np.ndarray:
 
 
 def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict | None) -> np.ndarray | None:
-    """Decodes an image of a parquet file, or of a file that it names, to RGB ``[H, W, 3]``; None if that fails.
+    """Decodes an image stored in a parquet file, or named there, to RGB ``[H, W, 3]``; returns None on failure.
 
     Raises:
-        ValueError: if the column holds no pictures.
+        ValueError: if the column contains no images.
     """
     if not isinstance(value, dict | None):
         raise ValueError(
@@ -421,15 +420,15 @@ def decode_image(root: Path, camera: str, episode: int, frame: int, value: dict 
 
 
 def stay_inside(root: Path, path: str, source: str) -> Path:
-    """Returns a path below a folder, as metadata name it.
+    """Returns the path of a file that metadata name, which must be inside of a folder.
 
     Args:
         root: the folder.
         path: relative to it.
-        source: what names the path, for the message.
+        source: name of the metadata, for the message.
 
     Raises:
-        ValueError: if it is absolute and elsewhere, or leads out of the folder.
+        ValueError: if the path leads out of the folder.
     """
     file = root / path
     if ".." in Path(path).parts or not file.is_relative_to(root) or "\0" in path:

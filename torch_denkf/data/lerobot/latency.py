@@ -1,4 +1,4 @@
-"""Estimates the latency between a recording's pictures and its states, in rows."""
+"""Estimates the latency between a recording's images and its states, in rows."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["lag_errors"]
 
-_SMALL = (30, 40)  # pixels that the regression sees of a picture, in grey
-_RIDGE = 0.02  # a share of the principal components' variances
+_SMALL = (30, 40)  # size of the grey images for the regression, pixels
+_RIDGE = 0.02  # relative to the principal components' variances
 
 
 def lag_errors(
@@ -28,28 +28,27 @@ def lag_errors(
     components: int = 150,
     folds: int = 5,
 ) -> dict[int, float]:
-    """Returns the error of predicting, from pictures, states that are recorded some rows later, for each lag.
+    """Returns, for each lag, the error of predicting from images the states that are recorded ``lag`` rows later.
 
-    The camera and the joints of a robot reach the recorder by different ways, and one may be later than the other. The
-    lag is where the error is smallest: ``lag = min(errors, key=errors.get)``, which
-    :class:`~torch_denkf.data.LeRobotReplay` takes as its ``lag``. A minimum at an edge says to look further out, and a
-    flat one that the lag hardly matters.
+    The camera and the joints of a robot may reach the recorder with different latencies. The lag with the smallest
+    error, ``lag = min(errors, key=errors.get)``, is the argument ``lag`` of :class:`~torch_denkf.data.LeRobotReplay`.
+    If the minimum is at an edge, try larger lags; if it is flat, the lag hardly matters.
 
-    Ridge regression from principal components of small grey pictures, on the same rows for every lag. Each episode is
-    predicted by a regression that has not seen it. Rows that are not observed do not count.
+    The predictor is a ridge regression from principal components of small grey images, cross-validated by episodes, on
+    the same rows for every lag. Rows that are not observed are left out.
 
     Args:
-        data: with ``lag=0``, of training episodes alone, and with ``repeats="mask"`` where pictures repeat.
-        lags: rows to try; k compares the picture of row t with the state of row t + k.
-        dims: numbers of the state that count; by default all that move.
-        components: principal components of the pictures.
-        folds: groups of episodes that are predicted by the others.
+        data: data set of training episodes only, opened with ``lag=0``, and with ``repeats="mask"`` if images repeat.
+        lags: lags to try, in rows; k compares the image of row t with the state of row t + k.
+        dims: components of the state to predict; by default all that vary.
+        components: number of principal components of the images.
+        folds: number of folds of the cross-validation.
 
     Returns:
-        By lag the root mean square error, in standard deviations of the numbers of the state.
+        Root mean square error by lag, in standard deviations of the state's components.
 
     Raises:
-        ValueError: if the data set has a lag already, fewer episodes than two, or episodes shorter than the lags ask.
+        ValueError: if the data set has a lag already, fewer than two episodes, or episodes too short for the lags.
 
     Examples:
         >>> from torch_denkf.data import LeRobotReplay
@@ -91,7 +90,7 @@ def lag_errors(
 
 
 def _small_pictures(data: LeRobotReplay, index: Tensor) -> Tensor:
-    """Returns grey pictures of some rows, ``[n, pixels]``."""
+    """Returns small grey images of some rows, ``[n, pixels]``."""
     parts = [adaptive_avg_pool2d(data[rows]["pixels"].mean(1, keepdim=True), _SMALL) for rows in index.split(256)]
     return torch.cat(parts).flatten(1)
 

@@ -1,4 +1,4 @@
-"""Masks invalid rows of a recording: they stay in their place, and are counted."""
+"""Masks invalid rows of a recording, keeps them in place, and counts them in a warning."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from torch_denkf.data.times import MOST_WRONG, filled, sound
 
 __all__ = ["mask_invalid_rows", "repaired_times"]
 
-OFF = 0.25  # a share of 1 / fps, by which the usual step may be off
+OFF = 0.25  # largest relative error of the median step against 1 / fps
 _NUMBERS = ("state", "action")
 
 
 def repaired_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times of an episode with values for those that are wrong, s, and which were right, bool; ``[n]`` each.
+    """Returns times of an episode with invalid ones interpolated, s, and the mask of valid ones; ``[n]`` each.
 
     Args:
-        times: as they are stored, s.
-        fps: rows a second.
+        times: stored times, s.
+        fps: rows per second.
         source: file and episode, for the message.
 
     Raises:
@@ -50,22 +50,22 @@ def repaired_times(times: np.ndarray, fps: float, source: str) -> tuple[np.ndarr
 
 
 def mask_invalid_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> TensorDict:
-    """Masks rows whose numbers or times are not sound, where there are any.
+    """Masks rows with a non-finite state or action, or an invalid time.
 
-    ``state`` and ``action`` of a row that are not finite hold those of the last row of the episode that are. The row is
-    not observed, is left out of losses (``("collector", "mask")``) and, by ``NAME_observed``, out of statistics. A
-    row with a wrong time is not observed. A warning counts both.
+    A ``state`` or ``action`` that is not finite is replaced by the last finite one of the episode. The row is not
+    observed, and is left out of losses (``("collector", "mask")``) and, by ``NAME_observed``, out of statistics. A row
+    with an invalid time is not observed. Warnings count both.
 
     Args:
         rows: batch size ``[N]``, with ``state``, ``observed``, ``episode``, ``frame`` and maybe ``action``; changed.
-        stamped: whether a row's time is right, bool ``[N]``; ``None`` for all.
-        source: where they are from, for the messages.
+        stamped: mask of valid times, bool ``[N]``; ``None`` if all are valid.
+        source: name of the recording, for the messages.
 
     Returns:
         The rows.
 
     Raises:
-        ValueError: if an episode has no row that is finite.
+        ValueError: if an episode has no finite row.
     """
     if stamped is not None and not bool(stamped.all()):
         _warn(rows, ~stamped, source, "a timestamp that does not increase", "observed False")
@@ -87,7 +87,7 @@ def mask_invalid_rows(rows: TensorDict, stamped: Tensor | None, source: str) -> 
 
 
 def _last_sound(episode: Tensor, finite: Tensor, name: str, source: str) -> Tensor:
-    """Returns for each row the last one of its episode that is finite, itself included, or else the next, ``[N]``."""
+    """Returns for each row the index of the last finite row of its episode up to it, or else of the next, ``[N]``."""
     row = torch.arange(len(episode))
     lengths = torch.unique_consecutive(episode, return_counts=True)[1]
     first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)

@@ -1,4 +1,4 @@
-"""A robot's recording: episodes of camera images with the joints' states, one row a frame."""
+"""Robot recordings: episodes of camera images with joint states, one row per frame."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from torch_denkf.data.video import frames_at_times
 from torch_denkf.deployment.progress import progress_bar
 from torch_denkf.diagnosis.logs import in_origin, look_at_numbers, warn_of_log
 
-_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 2  # part of the cache's key: raise it when the stored content changes
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class DecodedRecording:
     """Decoded data set that :class:`torch_denkf.data.LeRobotReplay` replays.
 
     Attributes:
-        rows: batch size ``[N]``, the rows of each episode one behind the other in time: ``image`` uint8 ``[N,3,H,W]``,
-            zeros where it is missing, ``observed`` bool ``[N,1]``, ``state`` float32 ``[N,S]``, maybe ``action``
-            float32 ``[N,A]``, ``time`` float64 ``[N,1]`` s, ``frame`` int64 ``[N,1]``, counted from 0 in each episode,
-            and ``episode`` int64 ``[N]``. Where a row's state or action is not finite, also the masks of
+        rows: batch size ``[N]``, the rows of each episode in order of time: ``image`` uint8 ``[N,3,H,W]``, zeros where
+            it is missing, ``observed`` bool ``[N,1]``, ``state`` float32 ``[N,S]``, maybe ``action`` float32 ``[N,A]``,
+            ``time`` float64 ``[N,1]`` s, ``frame`` int64 ``[N,1]``, counted from 0 in each episode, and ``episode``
+            int64 ``[N]``. If a state or action is not finite, also the masks of
             :func:`~torch_denkf.data.lerobot.masking.mask_invalid_rows`.
-        fps: rows a second.
-        names: of the state's numbers, if they have any.
-        source: folder that it was read from, if there is one.
+        fps: rows per second.
+        names: names of the state's components, if known.
+        source: folder of the recording, if there is one.
     """
 
     rows: TensorDict
@@ -74,10 +74,10 @@ def read_recording(
     Raises:
         ImportError: without pyarrow.
         FileNotFoundError: without the folder or one of its files.
-        ValueError: for what is unknown, damaged or contradicts itself.
+        ValueError: for unknown features and cameras, and for damaged or contradictory files.
     """
     layout = read_layout(root, camera, episodes)
-    if action_key == "action" and action_key not in layout.features:  # the default: actions where there are any
+    if action_key == "action" and action_key not in layout.features:  # the default: actions are optional
         action_key = None
         numbers = [key for key, one in layout.features.items() if one["dtype"] not in ("image", "video", "string")]
         look_for_actions(numbers, layout.meta[0])
@@ -111,7 +111,7 @@ def read_recording(
 
 
 def look_for_actions(keys: Iterable[str], place: object) -> None:
-    """Warns of entries that are called almost as actions are, and would be left out."""
+    """Warns of entries that are named like actions, but are not read."""
     close = [key for key in keys if re.search("action|command|cmd", key, re.IGNORECASE)]
     if close:
         warn_of_log(
@@ -139,7 +139,7 @@ class _Frames:
         self._bar = progress_bar("reading recordings", rows, unit=" frames", shown=progress)
 
     def put(self, rows: np.ndarray, image: np.ndarray, source: object) -> None:
-        """Scales an image and takes it for ``rows``."""
+        """Scales an image and stores it in ``rows``."""
         if self._native is None:
             self._native = image.shape[:2], source
         if image.shape[:2] != self._native[0]:

@@ -1,4 +1,4 @@
-"""Pictures that a recording shows again because no new one had arrived when the row was written."""
+"""Detects images that a recorder wrote again because no new one had arrived."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from torch_denkf.data.pictures import JoinedPictures
 
 __all__ = ["REPEAT_THRESHOLD", "repeated_pictures"]
 
-# Grey levels of 255. Measured on a Unitree G1's recording, encoded again by H.264: repeats differ by some 0.01, other
-# pictures by some 2, and 2 % of all lie between 0.025 and 0.12.
+# Grey levels of 255. In a recording of a Unitree G1, encoded by H.264, repeats differ by about 0.01, other images by
+# about 2, and 2 % of all differences are between 0.025 and 0.12.
 REPEAT_THRESHOLD = 0.08
 
 
 def repeated_pictures(
     pictures: Tensor | JoinedPictures, shown: Tensor, first: Tensor, threshold: float = REPEAT_THRESHOLD
 ) -> Tensor:
-    """Masks rows that repeat the picture of the row before.
+    """Masks rows that repeat the image of the row before.
 
-    A recorder that writes more rows than its camera takes pictures repeats some. A video's codec changes a repeated
-    picture a little, so that not only equal ones count. A repeat carries no news: a filter that takes it for a second
-    look becomes too sure of itself.
+    A recorder with a higher rate than its camera repeats images. A video codec changes a repeated image a little, so
+    that repeats are not exactly equal. A repeat has no new information: a filter that takes it for a new observation
+    becomes overconfident.
 
     Args:
         pictures: uint8 ``[M, C, H, W]``.
-        shown: numbers of the rows' pictures, int64 ``[N]``; negative for rows without a picture, which are skipped.
-        first: bool ``[N]``: the row begins an episode, and repeats nothing.
-        threshold: mean absolute difference in grey levels, of 255, below which a picture is a repeat.
+        shown: index of each row's image, int64 ``[N]``; negative for rows without an image, which are skipped.
+        first: first rows of episodes, which are no repeats, bool ``[N]``.
+        threshold: mean absolute difference in grey levels, of 255, below which an image is a repeat.
 
     Returns:
         bool ``[N]``.

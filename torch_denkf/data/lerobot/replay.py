@@ -1,4 +1,4 @@
-"""Recordings of real robots as one of torchrl's data sets."""
+"""TorchRL data set of recordings of real robots."""
 
 from __future__ import annotations
 
@@ -31,90 +31,91 @@ class LeRobotEpisode(Episode):
     """One episode of a recording.
 
     Attributes:
-        number: the recording's own.
+        number: number of the episode in the recording.
     """
 
     number: int
 
 
 def is_for_tests(number: int) -> bool:
-    """Returns True for the test episode among its five; it does not depend on the others."""
+    """Returns True for test episodes: of each five consecutive numbers, a hash selects one."""
     block, place = divmod(number, _FOLD)
     return hashlib.sha256(f"torch_denkf {block}".encode()).digest()[0] % _FOLD == place
 
 
 class LeRobotReplay(EpisodeReplay):
-    """Episodes of a robot's camera and joints, in LeRobot's format, as a replay buffer of their frames.
+    """Replay buffer of a robot's camera images and joint states in LeRobot's format.
 
     TorchRL's ``LeRobotExperienceReplay`` downloads from the hub and decodes videos when it samples, for
-    vision-language-action models. This class reads a folder, decodes once, to the size that a filter's sensor reads,
-    and hands out what a filter and its loss take. Keys, samples and splits are those of
+    vision-language-action models. This class reads a folder, decodes once, to the input size of a filter's sensor, and
+    returns samples for a filter and its loss. Keys, samples and splits are those of
     :class:`~torch_denkf.data.EpisodeReplay`; here the readings are
 
     ===================== ============ ===========================================================================
     key                   shape        content
     ===================== ============ ===========================================================================
-    ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB; zeros where the frame is missing
+    ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB; zeros if the frame is missing
     ``state``             [n,S]        float32, such as the joints' positions, in the recording's units
-    ``action``            [n,A]        float32, where there are any
-    ``observed``          [n,1]        bool: the frame is there, and its row is sound
+    ``action``            [n,A]        float32, if there are actions
+    ``observed``          [n,1]        bool: the frame exists, and its row is valid
     ===================== ============ ===========================================================================
 
     Rows whose state or action is not finite, or whose time does not increase, keep their place and are not observed; a
-    warning counts them. Where numbers are not finite, the row holds the last ones that are, is False in
+    warning counts them. A state or action that is not finite is replaced by the last finite one; its row is False in
     ``state_observed`` or ``action_observed``, and is left out of losses by ``("collector", "mask")``.
 
-    Frames are kept as uint8 at the size asked for, memory-mapped: 37 kB a frame of 96 x 128. All splits share an entry
-    of the cache.
+    Frames are stored as uint8 in the given ``size``, memory-mapped: 37 kB for a frame of 96 x 128. All splits share an
+    entry of the cache.
 
     Versions 2.0, 2.1 and 3.0 of the format are read, with videos or images. OpenCV decodes H.264 and others; AV1,
     LeRobot's default, needs PyAV, which comes with ``pip install 'torch_denkf[lerobot]'`` as does pyarrow for the
-    parquet files. A video's frame belongs to the row whose time it is nearest to, so that a damaged one blinds its own
-    row alone.
+    parquet files. A video's frame belongs to the row nearest in time, so that a damaged frame is missing in its own row
+    only.
 
-    Of the episodes 0 to 4, 5 to 9 and so on one each is for tests, drawn by a hash.
+    A hash selects one test episode from each block of five (0 to 4, 5 to 9, ...).
 
-    **Repeated pictures.** A recorder that writes more rows than its camera takes pictures shows some twice.
-    ``repeats="mask"`` marks the second one as not observed: it carries no news, and a filter that counts it becomes too
-    sure of itself. See :func:`torch_denkf.data.lerobot.repeats.repeated_pictures`.
+    **Repeated pictures.** A recorder with a higher rate than its camera writes some images twice. ``repeats="mask"``
+    marks the second one as not observed: a filter that takes it for a new observation becomes overconfident. See
+    :func:`torch_denkf.data.lerobot.repeats.repeated_pictures`.
 
-    **Lag.** The picture of row t may show the robot as the states record it ``lag`` rows later (negative: earlier).
-    With a ``lag``, each row pairs a state with the picture that shows it: the row of state t has the picture of row
-    t - lag, and each episode loses ``abs(lag)`` rows that have no partner. Actions stay with their states. On a robot,
-    with a positive lag, a filter that reads the newest picture says what the encoders will report ``lag`` rows later;
-    with a negative lag its belief is ``abs(lag)`` rows old. See :func:`torch_denkf.data.lag_errors` for an estimate.
+    **Lag.** The image of row t may belong to the state that is recorded ``lag`` rows later (negative: earlier). With a
+    ``lag``, the row of state t has the image of row t - lag, and each episode loses ``abs(lag)`` rows at an end.
+    Actions stay with their states. On a robot, a filter that was trained with a positive lag predicts, from the newest
+    image, the encoders ``lag`` rows ahead; with a negative lag its belief is ``abs(lag)`` rows old. See
+    :func:`torch_denkf.data.lag_errors` for an estimate.
 
     Args:
-        root: folder that holds ``meta`` and ``data``; or a recording that
-            :func:`torch_denkf.data.lerobot.rows.recording_from_rows` made, which has its camera, keys and size already.
+        root: folder with ``meta`` and ``data``; or a recording from
+            :func:`torch_denkf.data.lerobot.rows.recording_from_rows`, which ignores camera, keys and size.
         camera: key of the camera, such as ``"observation.images.top"`` or ``"top"``; None for the only one.
         state_key: feature of the state.
-        action_key: feature of the action; None for none, as are data sets without an ``"action"``.
-        size: (H, W) to scale the images to, whatever their aspect.
-        dims: numbers of the state to keep, in this order, by place or by name: an arm of a whole robot. None for all.
-        action_dims: numbers of the action to keep, by place. Commands to other joints are noise to a learned motion.
+        action_key: feature of the action; None reads no actions. The default may be missing from the data set.
+        size: (H, W) to scale the images to, ignoring their aspect ratio.
+        dims: components of the state to keep, in this order, by index or by name, such as one arm of a robot. None for
+            all.
+        action_dims: components of the action to keep, by index. Commands to other joints are noise to a learned motion.
         repeats: ``"keep"`` or ``"mask"`` repeated pictures.
-        lag: rows by which the states are later than the pictures.
-        episodes: numbers of the episodes to read, by default all; only their files must be there. It does not change
-            which of them are for tests.
-        origin: what is subtracted from ``"state"`` and ``"action"``, a number or one for each of theirs, in float64,
-            before they become float32, which has seven digits. A warning says where those are too few.
+        lag: rows by which the states are later than the images.
+        episodes: numbers of the episodes to read, by default all; only their files must exist. The selection does not
+            change the splits.
+        origin: offset that is subtracted from ``"state"`` and ``"action"``, a number or one for each component, in
+            float64, before the conversion to float32, which has seven digits. A warning says if those are too few.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Attributes:
         episodes: of this split, with the recording's own ``number``.
-        fps: rows a second.
-        names: of the state's numbers that are kept, such as the joints; None where the recording names none.
+        fps: rows per second.
+        names: names of the kept components of the state, such as the joints; None if the recording has no names.
         lag: as it was passed.
-        repeats_masked: rows of this split that are not observed because their picture is a repeat.
+        repeats_masked: number of rows of this split that are not observed because their image is a repeat.
 
     Raises:
         ImportError: without pyarrow.
-        FileNotFoundError: without the folder, a parquet file or a video; the message says how many are missing, and
-            which episodes are whole.
-        ValueError: for versions of the format that are not read, cameras, features and ``episodes`` that are not there,
-            files that are damaged or contradict the metadata, ``dims`` that are not there, splits without episodes,
-            episodes that are shorter than a slice or the lag, and other words for ``repeats``.
+        FileNotFoundError: without the folder, a parquet file or a video; the message counts the missing files, and
+            lists the complete episodes.
+        ValueError: for unsupported versions of the format, unknown cameras, features, ``episodes`` and ``dims``, files
+            that are damaged or contradict the metadata, splits without episodes, episodes that are shorter than a slice
+            or the lag, and an unknown ``repeats``.
 
     Examples:
         >>> data = LeRobotReplay("aloha_static_coffee", camera="cam_high", slice_len=16, batch_size=64)
@@ -215,7 +216,7 @@ class LeRobotReplay(EpisodeReplay):
 
 
 def _paired(rows: TensorDict, lag: int) -> tuple[TensorDict, Tensor]:
-    """Returns rows that have a partner ``lag`` rows before them, with their ``step``; and the partners' numbers."""
+    """Returns the rows with an image ``lag`` rows before, with their ``step``, and the indices of these images."""
     numbers, lengths = torch.unique_consecutive(rows["episode"], return_counts=True)
     if int(lengths.min()) <= abs(lag):
         short = numbers[lengths <= abs(lag)].tolist()
@@ -239,7 +240,7 @@ def _pictures_of_rows(images: JoinedPictures, shown: Tensor, row: Tensor) -> dic
 
 
 def _places(argument: str, dims: Sequence[int | str], names: tuple[str, ...] | None, width: int) -> list[int]:
-    """Places of the numbers that are asked for by place or name."""
+    """Returns the indices of components that are given by index or name."""
     places = {name: place for place, name in enumerate(names or ())}
     chosen = [places.get(dim, -1) if isinstance(dim, str) else int(dim) for dim in dims]
     if not chosen or not all(0 <= place < width for place in chosen):

@@ -1,4 +1,4 @@
-"""Turns rows of torchrl's robot data sets into a recording."""
+"""Conversion of rows of torchrl's robot data sets into a recording."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def recording_from_rows(
 ) -> DecodedRecording:
     """Turns rows as :class:`torchrl.data.datasets.OpenXExperienceReplay` stores them into a recording.
 
-    The defaults are the keys that most of the Open X-Embodiment sets have there, and those of
+    The defaults are the keys of most of the Open X-Embodiment sets, and of
     :class:`torchrl.data.datasets.LeRobotExperienceReplay`. Berkeley's UR5 set has others::
 
         data = OpenXExperienceReplay("berkeley_autolab_ur5", download=True, streaming=False)
@@ -50,28 +50,28 @@ def recording_from_rows(
         replay = LeRobotReplay(recording, batch_size=64, slice_len=16)
 
     Args:
-        rows: batch size ``[N]``, the rows of an episode one behind the other; or a replay buffer of such rows, which is
-            read in stretches and keeps its sampler.
-        fps: rows a second.
+        rows: batch size ``[N]``, the rows of an episode consecutive; or a replay buffer of such rows, which is read in
+            chunks and keeps its sampler.
+        fps: rows per second.
         pixels_key: images, ``[N, 3, H, W]`` or ``[N, H, W, 3]``, uint8, or floating in [0, 1]; or a tensordict with one
             camera.
-        state_key: numbers of the state, ``[N, S]`` or ``[N]``; a list of keys puts them one behind the other.
-        action_key: numbers of the action, ``[N, A]`` or ``[N]``, or a list of keys. None for none, as are rows without
-            an ``"action"``.
-        episode_key: a number for each row, the same in all rows of an episode and in no others.
+        state_key: state vector, ``[N, S]`` or ``[N]``; the entries of a list of keys are concatenated.
+        action_key: action vector, ``[N, A]`` or ``[N]``, or a list of keys. None reads no actions; the default key may
+            be missing from the rows.
+        episode_key: number of each row's episode; different episodes have different numbers.
         size: (H, W) to scale the images to. None keeps their size: uint8 images of a tensordict are then not copied,
-            and stay memory-mapped if they are.
-        names: of the state's numbers.
-        folder: holds copied images in a file that goes with the recording; None keeps them in memory.
+            and memory-mapped ones stay memory-mapped.
+        names: names of the state's components.
+        folder: folder for a temporary file of copied images; None keeps them in memory.
 
     Returns:
-        What :class:`torch_denkf.data.LeRobotReplay` takes instead of a folder. Times count from 0 in each
-        episode.
+        The recording, which :class:`torch_denkf.data.LeRobotReplay` takes instead of a folder. Times start at 0 in
+        each episode.
 
     Raises:
-        TypeError: for data that is streamed, and images that are still references to videos.
-        KeyError: for keys that are not there.
-        ValueError: for shapes other than those above, and episodes that are not in one piece.
+        TypeError: for streamed data, and images that are references to videos.
+        KeyError: for missing keys.
+        ValueError: for shapes other than those above, and episodes whose rows are not consecutive.
 
     Examples:
         >>> rows = TensorDict(
@@ -91,8 +91,8 @@ def recording_from_rows(
             "streamed data has no rows to index; open it with download=True, streaming=False, or pass a tensordict"
         ) from error
     if not count:
-        raise ValueError("there are no rows to make a recording of")
-    check_number("fps", fps, above=0, cure="It is the number of rows a second")
+        raise ValueError("there are no rows for a recording")
+    check_number("fps", fps, above=0, cure="It is the number of rows per second")
     stretches = [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
     whole = size is None and isinstance(rows, TensorDictBase)
     image = _images(rows, pixels_key) if whole else None
@@ -158,7 +158,7 @@ def _numbers(rows: TensorDictBase, keys: NestedKey | list[NestedKey]) -> Tensor:
 
 def _images(rows: TensorDictBase, key: NestedKey) -> Tensor:
     value = _get(rows, key)
-    if isinstance(value, TensorDictBase) and len(list(value.keys())):  # texts are tensordicts, too, of no keys
+    if isinstance(value, TensorDictBase) and len(list(value.keys())):  # text entries are tensordicts without keys
         cameras = list(value.keys())
         if len(cameras) != 1:
             raise KeyError(f"{_text(key)} has the cameras {', '.join(cameras)}; pass pixels_key= of one of them")
@@ -179,10 +179,10 @@ def _images(rows: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def _count_from_start(episode: Tensor, key: NestedKey) -> Tensor:
-    """Returns each row's number in its episode, ``[N, 1]``."""
+    """Returns the index of each row within its episode, ``[N, 1]``."""
     names, lengths = torch.unique_consecutive(episode, return_counts=True)
     if len(names.unique()) < len(names):
         torn = names[(names[:, None] == names).sum(1) > 1].unique().tolist()
-        raise ValueError(f"by {_text(key)}, the rows of these episodes are not in one piece: {torn[:10]}; sort them")
+        raise ValueError(f"by {_text(key)}, the rows of these episodes are not consecutive: {torn[:10]}; sort them")
     starts = lengths.cumsum(0) - lengths
     return (torch.arange(len(episode)) - starts.repeat_interleave(lengths)).unsqueeze(-1)

@@ -1,1 +1,1 @@
-"""One's own recordings: pictures and tables of numbers over time, brought onto one clock."""
+"""Recordings of users: images and tables of readings over time, resampled onto one clock."""

@@ -1,4 +1,4 @@
-"""Topics of ROS bags as columns of numbers: ROS 1, ROS 2 and MCAP."""
+"""Reads topics of ROS bags as numeric columns: ROS 1, ROS 2 and MCAP."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 __all__ = ["bag_topics", "is_bag", "read_topic"]
 
 EXTRA = "pip install 'torch_denkf[ros]'"
-_LONGEST = 64  # numbers of an array: of a covariance, not of a picture or a scan
+_LONGEST = 64  # largest array to read: a covariance, but no image or scan
 
 
 def is_bag(file: Path) -> bool:
-    """Tells whether a path is that of a ROS bag."""
+    """Returns True for the path of a ROS bag."""
     return file.suffix.lower() in (".bag", ".mcap", ".db3") or (file.is_dir() and (file / "metadata.yaml").is_file())
 
 
@@ -33,15 +33,15 @@ def bag_topics(file: Path) -> dict[str, str]:
 
 
 def read_topic(file: Path, topic: str | None = None) -> tuple[str, dict[str, np.ndarray]]:
-    """Reads the numbers of a topic's messages.
+    """Reads the numeric fields of a topic's messages.
 
     Args:
         file: the bag.
-        topic: by default the one that the bag has.
+        topic: name of the topic; may be left out if the bag has only one.
 
     Returns:
-        The topic, and columns ``[n]`` by name: ``time``, s, of the header's stamp, or of the recording where there is
-        none; ``recorded``, s; and the numbers of the messages, such as ``twist.twist.linear.x``.
+        The topic, and columns ``[n]`` by name: ``time``, s, of the header's stamp, or of the recording if there is
+        none; ``recorded``, s; and the numeric fields of the messages, such as ``twist.twist.linear.x``.
 
     Raises:
         FileNotFoundError: without the file.
@@ -83,7 +83,7 @@ def _opened(file: Path) -> Iterator[Any]:
 
 
 def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
-    """The numbers in a message, with their names."""
+    """Yields name and value of each numeric field of a message."""
     if isinstance(value, (bool, int, float, np.number, np.bool_)):
         yield name, float(value)
     elif isinstance(value, np.ndarray) and len(value) <= _LONGEST and value.dtype.kind in "fiub":

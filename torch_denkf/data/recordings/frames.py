@@ -1,4 +1,4 @@
-"""Pictures of a camera over time: a video, or a folder of images, decoded once."""
+"""Camera images over time: a video, or a folder of images, decoded once."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ from torch_denkf.diagnosis.logs import SECONDS, Unit, look_at_times
 
 __all__ = ["Frames", "Images", "Video"]
 
-_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 2  # part of the cache's key: raise it when the stored content changes
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Base of a camera's pictures; take :class:`Video` or :class:`Images`.
+    """Base class of a camera's images; use :class:`Video` or :class:`Images`.
 
     Args:
         file: the video, or the folder of images.
-        times: when each picture was taken: a CSV or Parquet file with one row a picture, or the times themselves. By
-            default a video's own clock, and the numbers in the images' names.
-        time: name of the column of times in that file.
+        times: times at which the images were taken: a CSV or Parquet file with one row per image, or an array. By
+            default the times in the video, or the numbers in the images' names.
+        time: name of the column with times in that file.
         unit: of these times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
-        start: in s, added to all times: when a video began, on the clock of the other streams.
-        sample: which picture a row of the data set gets: ``"last"``, the last one up to then; or ``"nearest"``, the
-            nearest in time, which may lie in the future. A picture is shown in one row alone; rows without one of their
-            own are not ``observed``.
-        tolerance: in s; pictures that are farther away count as missing. By default, none with ``"last"``, half a
-            row's time with ``"nearest"``.
+        start: offset in s, added to all times, such as the start of a video on the clock of the other streams.
+        sample: image for a row of the data set: ``"last"``, the last one up to the row's time, delayed by up to one
+            row; or ``"nearest"``, the nearest in time, which may be in the future, for smoothing. Each image appears in
+            one row only; rows without an image are not ``observed``.
+        tolerance: in s; images that are farther away in time count as missing. By default no limit with ``"last"``,
+            half a row's time with ``"nearest"``.
 
     Raises:
-        ValueError: for an unknown ``unit`` or ``sample``, tolerances that are not positive, and a ``start`` that is no
-            time.
+        ValueError: for an unknown ``unit`` or ``sample``, tolerances that are not positive, and a ``start`` that is not
+            finite.
     """
 
     file: str | Path
@@ -67,13 +67,13 @@ class Frames:
         check_number("start", self.start, cure="It is a time in s")
 
     def read(self, size: tuple[int, int], cache: str | Path | bool | None, progress: bool) -> TensorDict:
-        """Reads all pictures, batch size ``[F]``: ``pixels`` uint8 ``[F, 3, H, W]``, RGB, and ``time`` float64, s.
+        """Reads all images, batch size ``[F]``: ``pixels`` uint8 ``[F, 3, H, W]``, RGB, and ``time`` float64, s.
 
-        They are decoded once and then come memory-mapped from the cache, whatever the clock.
+        They are decoded once, and memory-mapped from the cache afterwards.
 
         Raises:
             FileNotFoundError: without the file or folder.
-            ValueError: if none can be decoded, they differ in size, or their times are not as many or do not ascend.
+            ValueError: if none can be decoded, their sizes differ, or their times differ in number or do not ascend.
             OSError: if the cache cannot be written.
         """
         source = Path(os.path.realpath(Path(self.file).expanduser()))  # also of a link to itself
@@ -91,21 +91,21 @@ class Frames:
         return TensorDict({"pixels": stored["pixels"], "time": torch.from_numpy(times)}, stored.batch_size)
 
     def _files(self, source: Path) -> list[Path]:
-        """Returns the files that are decoded, in order."""
+        """Returns the files to decode, in order."""
         raise NotImplementedError
 
     def _pictures(self, files: list[Path]) -> Iterator[tuple[float, np.ndarray | None, str]]:
-        """Returns each picture's own time, its RGB pixels (None if it is damaged), and its name for messages."""
+        """Yields time, RGB pixels (None if damaged), and the name for messages of each image."""
         raise NotImplementedError
 
     def _own_times(self, source: Path, stored: TensorDict) -> np.ndarray:
-        """Returns times of the pictures, where none were passed, s."""
+        """Returns the default times of the images, s."""
         return stored["time"].numpy().copy()
 
     def _times(self, source: Path, stored: TensorDict) -> np.ndarray:
         if self.times is None:
             return self._own_times(source, stored) + self.start
-        # Damaged pictures are not stored: the place of each tells which time is its own.
+        # Damaged images are not stored: "place" is the index of each stored image in the list of times.
         kept, there = stored["place"].numpy(), int(stored["count"][0])
         times, place = given_times(self.times, self.time, str(source), there, "pictures")
         check_times(times * SECONDS[self.unit], place, self.time)
@@ -142,8 +142,8 @@ class Frames:
 class Video(Frames):
     """A camera's video file; see :class:`Frames` for the arguments.
 
-    OpenCV decodes most codecs; AV1 needs PyAV: ``pip install 'torch_denkf[lerobot]'``. Times are those at which the
-    frames are shown, counted from the video's first frame.
+    OpenCV decodes most codecs; AV1 needs PyAV: ``pip install 'torch_denkf[lerobot]'``. Times are the presentation times
+    of the frames, relative to the video's first frame.
 
     Examples:
         >>> Video("run1.mp4", start=12.5).sample
@@ -166,14 +166,14 @@ class Video(Frames):
 
 @dataclass(frozen=True)
 class Images(Frames):
-    """A folder of images of one camera, in the order of their names; see :class:`Frames` for the arguments.
+    """A folder of images of one camera, sorted by name; see :class:`Frames` for the arguments.
 
     Args:
-        rate: pictures a second, from ``start`` on, in the place of ``times``. Where the images are numbered, a number
-            that is missing is a picture that is missing; a warning counts them.
+        rate: images per second, from ``start`` on, instead of ``times``. A gap in the numbers of the images is a
+            missing image; a warning counts them.
 
     Raises:
-        ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``times`` next to it.
+        ValueError: as :class:`Frames`, for a ``rate`` that is not positive, and for ``rate`` together with ``times``.
 
     Examples:
         >>> Images("run1/images", rate=10.0).sample
@@ -217,12 +217,12 @@ class Images(Frames):
 
 
 def _counted(source: Path, files: list[Path]) -> np.ndarray:
-    """Counts the frames of a camera of steady rate before each: where names end in numbers, one may be missing."""
+    """Returns the frame number of each image at a steady rate; gaps in numbered names are missing images."""
     numbers = np.array([_number(file) or float((re.findall(r"\d+", file.stem) or "0")[-1]) for file in files])
     steps = np.diff(numbers)
     least = steps.min(initial=np.inf)
     if least <= 0 or not np.allclose(steps / least, (steps / least).round(), rtol=0, atol=1e-6):
-        return np.arange(len(files))  # names that do not count
+        return np.arange(len(files))  # the names are not equally spaced numbers
     counted = ((numbers - numbers[0]) / least).round()
     missing = int(counted[-1]) + 1 - len(files)
     if missing:
@@ -236,7 +236,7 @@ def _counted(source: Path, files: list[Path]) -> np.ndarray:
 
 
 def _number(file: Path) -> float | None:
-    """Returns the number that a file is called."""
+    """Returns the number in a file's name; ``None`` if the name is no number."""
     try:
         return read_number(file.stem)
     except ValueError:
@@ -244,17 +244,17 @@ def _number(file: Path) -> float | None:
 
 
 def _in_order(file: Path) -> tuple[list[float], str]:
-    """Sorts by number, or by the numbers in the name: img_9 comes before img_10."""
+    """Returns the sort key: the number, or the numbers in the name, so that img_9 comes before img_10."""
     number = _number(file)
     return [float(part) for part in re.findall(r"\d+", file.stem)] if number is None else [number], file.name
 
 
 class _Store:
-    """Pictures one behind the other, however many: in memory, or in a file that goes when they are let go.
+    """Growing store of images: in memory, or in a temporary file.
 
     Args:
         size: (H, W).
-        folder: where the file is; None for memory.
+        folder: folder of the file; None for memory.
     """
 
     def __init__(self, size: tuple[int, int], folder: Path | None):
@@ -263,7 +263,7 @@ class _Store:
         self._folder = folder or Path()
 
     def add(self, pixels: np.ndarray) -> None:
-        """Keeps a picture ``[3, H, W]``."""
+        """Appends an image ``[3, H, W]``."""
         data = np.ascontiguousarray(pixels).tobytes()
         if self._file is None:
             self._memory += data
@@ -272,7 +272,7 @@ class _Store:
                 self._file.write(data)
 
     def pictures(self, count: int) -> torch.Tensor:
-        """Returns all of them, uint8 ``[count, 3, H, W]``."""
+        """Returns all images, uint8 ``[count, 3, H, W]``."""
         shape = (count, 3, *self._size)
         if self._file is None:
             return torch.frombuffer(self._memory, dtype=torch.uint8).reshape(shape)

@@ -1,4 +1,4 @@
-"""Delays between the streams of a log, found by what two of them know both."""
+"""Estimates delays between the streams of a log from quantities that two streams have in common."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from torch_denkf.diagnosis.logs import repeats
 
 __all__ = ["ClockOffset", "Delay", "changes_of", "clock_offsets", "delays_between", "solved"]
 
-_SPANS = (1.0, 2.0)  # s: over which changes of heading, and ways, are compared: the longer, the less noise counts
-_STEP = 0.02  # s: of the search
-_LEAST = 30  # comparisons
-_AGREE = 0.6  # correlation: streams that agree less have nothing in common
-_NOISY = 0.9  # correlation: of slow robots the noise of fixes is much of a short way
-_BLOCK = 4.0  # spans, after which errors are forgotten
-_BETTER = 0.7  # of its standard deviation: the longer span is taken where it is so much better, not by chance
-_STEADY = 0.02  # the variation of a signal that says nothing
+_SPANS = (1.0, 2.0)  # s: intervals of the compared changes; longer ones average more noise
+_STEP = 0.02  # s: step of the search
+_LEAST = 30  # fewest comparisons
+_AGREE = 0.6  # smallest correlation of two streams with a common quantity
+_NOISY = 0.9  # correlation below which the noise of fixes is much of a short way, as of slow robots
+_BLOCK = 4.0  # spans, after which errors are taken to be independent
+_BETTER = 0.7  # ratio of standard deviations below which the longer span is preferred
+_STEADY = 0.02  # relative variation below which a signal counts as constant
 
 
 class ClockOffset(NamedTuple):
-    """The correction of a stream's clock.
+    """Correction of a stream's clock.
 
     Attributes:
-        seconds: the ``offset`` to give to its table; zero for the stream that the others are compared with.
+        seconds: value for the table's ``offset``; zero for the reference stream.
         std: its standard deviation, s.
     """
 
@@ -46,16 +46,16 @@ class ClockOffset(NamedTuple):
 
 
 class Delay(NamedTuple):
-    """The delay of one stream behind another, from one thing that both know.
+    """Delay of one stream relative to another, from one common quantity.
 
     Attributes:
         late: the stream that is later, if ``seconds`` is positive.
         early: the other one.
-        what: both know, ``"heading"`` or ``"way"``.
+        what: common quantity, ``"heading"`` or ``"way"`` (distance travelled).
         seconds: the delay.
         std: its standard deviation, s.
-        scale: the numbers of ``late`` over those of ``early``.
-        correlation: of both, at that delay.
+        scale: ratio of the quantity in ``late`` to that in ``early``.
+        correlation: correlation of the two streams at that delay.
     """
 
     late: str
@@ -68,7 +68,7 @@ class Delay(NamedTuple):
 
 
 class _Signal(NamedTuple):
-    """A thing that a stream knows: times ``[n]``, a heading or way ``[n]`` or fixes ``[n, 2]``, and weights ``[n]``."""
+    """Quantity of a stream: times ``[n]``, a heading or distance ``[n]`` or fixes ``[n, 2]``, and weights ``[n]``."""
 
     times: np.ndarray
     level: np.ndarray
@@ -76,22 +76,22 @@ class _Signal(NamedTuple):
 
 
 def clock_offsets(recording: Recording, *, most: float = 5.0) -> dict[str, ClockOffset]:
-    """Finds by how much the stamps of a recording's streams are off, by what two of them know both.
+    """Estimates clock offsets between a recording's streams from quantities that two streams have in common.
 
-    Turn rates, headings and the directions between fixes are compared, and so are speeds and the ways between fixes.
-    Columns are known by usual names, such as ``yawrate``, ``course``, ``speed``, ``x``, ``latitude`` and
-    ``twist.twist.linear.x``; units do not matter. The robot must turn, or change its speed, some times.
+    Turn rates, headings and the directions between fixes are compared, and so are speeds and the distances between
+    fixes. Columns are recognised by usual names, such as ``yawrate``, ``course``, ``speed``, ``x``, ``latitude`` and
+    ``twist.twist.linear.x``; units do not matter. The robot must turn, or change its speed, several times.
 
     Args:
-        recording: its tables.
+        recording: recording whose tables are compared.
         most: s, the largest delay between two streams.
 
     Returns:
-        By the names of the streams that have something in common: what to add to their times, beside the fastest one
-        that knows turns.
+        By stream name, for streams with a common quantity: offset to add to their times, relative to the stream of turn
+        rates with the highest rate.
 
     Raises:
-        ValueError: if no two streams know the same.
+        ValueError: if no two streams have a common quantity.
 
     Examples:
         >>> from tempfile import mkdtemp
@@ -106,7 +106,7 @@ def clock_offsets(recording: Recording, *, most: float = 5.0) -> dict[str, Clock
     """
     streams = {name: stream for name, stream in recording.streams.items() if isinstance(stream, Table)}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of float32, which no number becomes here
+        warnings.simplefilter("ignore")  # warnings of float32, which is not used here
         tables = {name: replace(stream, origin=None).read() for name, stream in streams.items()}
     delays = delays_between(tables, most)
     if not delays:
@@ -118,7 +118,7 @@ def clock_offsets(recording: Recording, *, most: float = 5.0) -> dict[str, Clock
 
 
 def solved(delays: Sequence[Delay], tables: Mapping[str, Readings]) -> dict[str, ClockOffset]:
-    """Solves delays of pairs for offsets, by least squares, beside the fastest stream that knows turns."""
+    """Computes offsets from delays of pairs by least squares, relative to the fastest stream of turn rates."""
     linked = {name: tables[name] for delay in delays for name in (delay.late, delay.early)}
     turning = [name for name, table in linked.items() if find(table.columns, "turn rate")] or list(linked)
     first = min(turning, key=lambda name: float(np.median(np.diff(linked[name].times))))
@@ -150,7 +150,7 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
         most: s, the largest delay.
 
     Returns:
-        The delays of pairs that have something in common.
+        Delays of the pairs that have a common quantity.
     """
     known = {name: _signals(table) for name, table in tables.items()}
     out = []
@@ -158,20 +158,21 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
         for what in known[one].keys() & known[other].keys():
             early, late = sorted((one, other), key=lambda name: (known[name][what].level.ndim, len(tables[name].times)))
             if known[early][what].level.ndim == 1 and known[late][what].level.ndim == 1:
-                early, late = late, early  # the slow one is compared at its own times
+                early, late = late, early  # the comparison is at the times of the slower one
             if known[early][what].level.ndim == 1:
-                # Shifts leave out the ends of a log, where a robot begins to move: the fewer, the more it says.
+                # Large shifts leave out the ends of a log, where a robot starts to move; smaller limits keep them.
                 pair = known[early][what], known[late][what]
                 tried = [_delay(*pair, what, limit, _SPANS[0]) for limit in (most, most / 3, most / 9)]
                 sizes = [0.0 if one is None else abs(one[3]) for one in tried]
                 best = int(np.argmax(sizes))
                 limit = most / 3**best
                 found = tried[best]
-                # A chord of some seconds is shorter than a way, which matters less than much noise.
+                # Chords of curves are shorter than the way, which matters less than much noise.
                 if what == "heading" or pair[1].level.ndim == 1 or sizes[best] < _NOISY:
                     longer = _delay(*pair, what, limit, _SPANS[1])
                     if found is not None and longer is not None:
-                        # The better one by chance: what their intervals do not explain counts, too.
+                        # The variance includes the part of the difference between both spans that their variances do
+                        # not explain.
                         apart = (found[0] - longer[0]) ** 2 - max(found[1], longer[1]) ** 2
                         found = longer if longer[1] < _BETTER * found[1] else found
                         found = (found[0], float(np.sqrt(found[1] ** 2 + max(apart, 0.0) / 4)), *found[2:])
@@ -182,7 +183,7 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
 
 
 def changes_of(tables: Mapping[str, Readings], offsets: Mapping[str, float]) -> tuple[dict, dict]:
-    """Times of the streams, and the changes of heading and way that several know, all after correction.
+    """Returns corrected times of the streams, and the changes of heading and distance that several streams measure.
 
     Args:
         tables: readings by stream.
@@ -209,14 +210,14 @@ def changes_of(tables: Mapping[str, Readings], offsets: Mapping[str, float]) -> 
                 scale = np.quantile(np.abs(value), 0.95) if len(value) else 0.0
                 at, value = at + 0.5 - begin + offsets.get(name, 0.0), value / (scale or 1.0)
                 other = np.interp(at, *next(iter(drawn.values()))) if drawn else value
-                drawn[name] = at, value * (1.0 if (value * other).sum() >= 0 else -1.0)  # clockwise, in some logs
+                drawn[name] = at, value * (1.0 if (value * other).sum() >= 0 else -1.0)  # sign: clockwise in some logs
         if len(drawn) > 1:
             changes[title] = drawn
     return steps, changes
 
 
 def _signals(table: Readings) -> dict[str, _Signal]:
-    """Lists the headings and ways that a stream knows."""
+    """Returns the headings and distances that a stream measures."""
     columns, times, values = table.columns, table.times, table.values
     known = [place for place, name in enumerate(columns) if quantity(name)]
     if any(repeats(values[:, place]) for place in known):
@@ -245,7 +246,7 @@ def _integral(times: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _delay(
     early: _Signal, late: _Signal, what: str, most: float, span: float
 ) -> tuple[float, float, float, float] | None:
-    """Delay, its standard deviation, scale and correlation; ``None`` where both have too little in common.
+    """Returns delay, its standard deviation, scale and correlation; ``None`` if the overlap or variation is too small.
 
     The changes of the late stream over a span are compared with those of the early one over the same span, shifted.
     """
@@ -253,7 +254,7 @@ def _delay(
     end = np.searchsorted(late.times, late.times + span - 1e-6)
     fixes = late.level.ndim == 2
     corners = fixes and what == "heading"
-    last = np.append(end, len(end))[end] if corners else end  # a span later than the end
+    last = np.append(end, len(end))[end] if corners else end  # one span after the end
     until = np.append(late.times, np.inf)[last]
     begin = np.flatnonzero((late.times > early.times[0] + most) & (until < early.times[-1] - most))
     took = until[begin] - late.times[begin]
@@ -298,11 +299,11 @@ def _delay(
     slope = centred(-scale * (model(shift + _STEP) - model(shift - _STEP)) / (2 * _STEP))
     slope -= x * (weight * x * slope).sum() / (weight * x * x).sum()
     score = weight * slope * (centred(change) - scale * x)
-    # Errors last: blocks of some spans are taken to be independent, and each is left out once.
+    # Errors are correlated in time: the variance is a jackknife over blocks of several spans.
     block = ((late.times[begin] - late.times[begin[0]]) // max(_BLOCK * span, 8.0)).astype(int)
     sums, known = np.bincount(block, score), np.bincount(block, weight * slope * slope)
-    blocks = max(2.0, float(known.sum() ** 2 / np.square(known).sum()))  # that say as much as others
-    with np.errstate(over="ignore"):  # of a single block, which leaves nothing: infinite
+    blocks = max(2.0, float(known.sum() ** 2 / np.square(known).sum()))  # effective number of blocks
+    with np.errstate(over="ignore"):  # with a single block the variance is infinite
         variance = np.square(sums / (known.sum() - known).clip(min=1e-300)).sum()
     variance = variance * (1 + 1.2 / (blocks - 1)) ** 2 + np.median(np.diff(early.times)) ** 2 / 12
     return shift, float(np.sqrt(variance)), scale, correlation

@@ -1,4 +1,4 @@
-"""The meaning of a log's columns, by their names: places, speeds, headings, turn rates."""
+"""Recognises quantities by the names of a log's columns: positions, speeds, headings, turn rates."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 __all__ = ["SPEEDS", "find", "in_radians", "quantity", "speed_unit"]
 
-#: Units of speeds: how many are one m/s, and how their names look.
+#: Units of speed: factor from m/s, and pattern of their names.
 SPEEDS = {"km/h": (3.6, r"km/?h|kph|kmph"), "mph": (2.23694, r"mph"), "knots": (1.94384, r"kn|kts?|knots?")}
 
 _AXIS = r"(?:^|(?:.*[._ /])?(?:pose|pos|position|utm|map|gps|fix|translation)[._ /])(?:p|t|pos)?_?"
-#: Patterns of the names of columns, in lower case and without units, by what they mean.
+#: Patterns of column names, in lower case and without units, by quantity.
 _NAMES = {
     "latitude": r".*latitude|.*\blat",
     "longitude": r".*longitude|.*\b(lon|lng|long)",
@@ -24,11 +24,11 @@ _NAMES = {
     "speed": r".*(speed|velocity|\bsog|\bvx|\bv|(twist[._])?linear[._]x|v_forward)",
     "acceleration": r".*(\bax|acc(el(eration)?)?_?x|linear_acceleration[._]x|a_rs_s_x)",
 }
-_DEGREES = 7.0  # rad: beyond are no headings in rad
+_DEGREES = 7.0  # rad: larger headings are in degrees
 
 
 def quantity(name: str) -> str | None:
-    """The quantity that a column holds, by its name.
+    """Returns the quantity that a column's name means; ``None`` if it is unknown.
 
     Examples:
         >>> quantity("twist.twist.angular.z"), quantity("yawrate"), quantity("Latitude (deg)"), quantity("hdop")
@@ -39,13 +39,13 @@ def quantity(name: str) -> str | None:
 
 
 def find(columns: Sequence[str], *wanted: str) -> list[int] | None:
-    """The places of the first columns that hold some quantities; ``None`` where one is not there."""
+    """Returns the indices of the first columns with the given quantities; ``None`` if one is missing."""
     found = [quantity(name) for name in columns]
     return [found.index(what) for what in wanted] if set(wanted) <= set(found) else None
 
 
 def speed_unit(name: str, scale: float = 1.0) -> str | None:
-    """The unit of a speed, by its column's name, of km/h also by a scale; ``None`` for m/s.
+    """Returns the unit of a speed by its column's name, or km/h by its scale; ``None`` for m/s.
 
     Examples:
         >>> speed_unit("SOG [kn]"), speed_unit("speed_kmh"), speed_unit("speed", 3.7), speed_unit("speed", 2.2)
@@ -54,9 +54,9 @@ def speed_unit(name: str, scale: float = 1.0) -> str | None:
     for unit, (_, pattern) in SPEEDS.items():
         if re.search(rf"(?<![a-z])({pattern})(?![a-z])", name.lower()):
             return unit
-    return "km/h" if 3.1 < scale < 4.2 else None  # others are too near to 1 for a scale that noise makes smaller
+    return "km/h" if 3.1 < scale < 4.2 else None  # other units' scales are too near to 1, as noise reduces them
 
 
 def in_radians(angles: np.ndarray) -> np.ndarray:
-    """Headings in rad: those beyond a turn are in degrees."""
+    """Returns headings in rad; values beyond a full turn are taken for degrees."""
     return np.radians(angles) if np.abs(angles).max(initial=0.0) > _DEGREES else angles

@@ -1,4 +1,4 @@
-"""One's own recordings as one of torchrl's data sets."""
+"""TorchRL data set of users' recordings."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from torch_denkf.diagnosis.logs import look_at_repeats
 
 __all__ = ["Recording", "RecordingReplay"]
 
-_LITTLE = 0.2  # a share of readings: fewer of them in the common time are a mistake in the unit, more often than not
-_LOST = 0.02  # a share of readings, or of time, that may be lost without a word
-_LONG = 1.0  # s, of a recording however long, likewise
-_PICTURE = "_picture"  # entry of the rows while they are made: the number of each one's picture
+_LITTLE = 0.2  # share of readings; fewer in the common time hint at a wrong unit
+_LOST = 0.02  # share of readings, or of time, that may be lost without a warning
+_LONG = 1.0  # s of a recording that may be lost without a warning, at most
+_PICTURE = "_picture"  # temporary entry of the rows: the index of each row's image
 _TAKEN = (
     "episode",
     "step",
@@ -49,18 +49,17 @@ _TAKEN = (
 
 
 class Recording:
-    """One episode: a camera and other streams, each with times of its own on one common clock.
+    """One episode: a camera and other streams, each with its own sampling times on a common clock.
 
     Args:
-        name: of the episode; by default that of the first stream's file.
-        **streams: by the names that they get in the data set. One may be pictures, a
-            :class:`~torch_denkf.data.Video` or :class:`~torch_denkf.data.Images`; the others are
-            :class:`~torch_denkf.data.Table`. ``state`` is the truth, ``action`` what was commanded; other names are
-            yours.
+        name: name of the episode; by default that of the first stream's file.
+        **streams: streams by their names in the data set. One may be images, a :class:`~torch_denkf.data.Video` or
+            :class:`~torch_denkf.data.Images`; the others are :class:`~torch_denkf.data.Table`. ``state`` is the ground
+            truth, ``action`` the command; other names are free.
 
     Raises:
-        TypeError: for streams that are neither pictures nor tables.
-        ValueError: without streams, with two cameras, or with names that the data set needs itself.
+        TypeError: for streams that are neither images nor tables.
+        ValueError: without streams, with two cameras, or with reserved names.
 
     Examples:
         >>> from torch_denkf.data import Table, Video
@@ -99,65 +98,66 @@ class RecordingEpisode(Episode):
     """One recording.
 
     Attributes:
-        begin: time of its first row, in s, on the recording's own clock.
+        begin: time of the first row, in s, on the recording's clock.
     """
 
     begin: float
 
 
 class RecordingReplay(EpisodeReplay):
-    r"""One's own recordings, as a replay buffer of rows on one clock.
+    r"""Replay buffer of users' recordings, resampled to rows on one clock.
 
     Keys, samples and splits are those of :class:`~torch_denkf.data.EpisodeReplay`; here the readings are
 
     ===================== ============ ===========================================================================
     key                   shape        content
     ===================== ============ ===========================================================================
-    ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB, of the camera, whatever its stream is called
-    ``observed``          [n,1]        bool: the row has a picture of its own; other rows' pixels are zero. Only where
-                                       there is a camera
-    NAME                  [n,C]        float32: the columns of the table ``NAME``, such as ``state``; zero where
-                                       missing
-    ``NAME_observed``     [n,1]        bool: the row has a reading of its own
-    ``NAME_late``         [n,1]        int64, for tables with ``arrived``: by how many rows the reading is late
+    ``pixels``            [n,3,H,W]    float32 in [0, 1], RGB, of the camera, independent of its stream's name
+    ``observed``          [n,1]        bool: the row has a new image; other rows' pixels are zero. Only with a camera
+    NAME                  [n,C]        float32: the columns of the table ``NAME``, such as ``state``; zero if missing
+    ``NAME_observed``     [n,1]        bool: the row has a new reading
+    ``NAME_late``         [n,1]        int64, for tables with ``arrived``: latency of the reading in rows
     ===================== ============ ===========================================================================
 
     Rows are the times of the stream ``clock``, or of a rate, from where all streams have begun to where the first one
-    ends: ``episodes[k].begin`` is the time of the first. So a pose that is known of an earlier time is not that of the
-    first row, unless ``span="all"`` keeps the rows before it. Each other stream comes onto them by its ``sample``:
+    ends: ``episodes[k].begin`` is the time of the first. A pose from an earlier time is therefore not the pose of the
+    first row, unless ``span="all"`` keeps the rows before it. The other streams are resampled to these rows by their
+    ``sample``:
 
-    * ``"last"``, the default, holds the last value until the next one arrives. It never looks into the future.
-    * ``"nearest"`` and ``"linear"`` do, by up to one reading. They suit a ``state`` that is known afterwards.
+    * ``"last"``, the default, is a zero-order hold of the last value. It is causal, and delays readings by up to one
+      row.
+    * ``"nearest"`` uses readings up to half a row ahead. Use it for smoothing: a delay of part of a row is a bias.
+    * ``"linear"`` uses the next reading, too. It suits a ``state`` that is known afterwards.
 
     A reading is *observed* in one row: with ``"last"`` the first row after it arrived, with ``"nearest"`` its nearest.
-    So a filter with ``observed_key="imu_observed"`` does not count one reading twice, and a model that is driven by the
-    held value, such as an ``action``, reads it in all rows. ``"observed"``, the filters' default, is the camera's.
-    With ``"linear"`` every value counts as observed. Readings that come late, of a :class:`~torch_denkf.data.Table`
-    with ``arrived``, are observed in the first row after they arrived.
+    A filter with ``observed_key="imu_observed"`` then uses each reading once, and a model that reads the held value,
+    such as an ``action``, finds it in all rows. ``"observed"``, the filters' default, is the camera's mask. With
+    ``"linear"`` every value counts as observed. Delayed readings, of a :class:`~torch_denkf.data.Table` with
+    ``arrived``, are observed in the first row after they arrived.
 
-    Pictures are decoded once, scaled to ``size`` and memory-mapped. Tables are read again each time.
+    Images are decoded once, scaled to ``size`` and memory-mapped. Tables are read again each time.
 
     Args:
         recordings: one, or several with the same streams; each is an episode.
-        clock: name of the stream whose times the rows have, or a rate in Hz; by default the camera's, or else the
-            first stream's.
+        clock: name of the stream whose times become the rows' times, or a rate in Hz; by default the camera, or else
+            the first stream.
         span: ``"common"``: rows from where all streams have begun to where the first one ends; a warning says how much
-            is left out. ``"all"``: all times of the ``clock``, a rate's from where the first stream begins to where the
-            last one ends. A stream is zero and not observed before it begins, and not observed after its end.
-        size: (H, W) to scale the pictures to, whatever their aspect.
-        test_share: share of the recordings that are for tests, by a hash of their names; none by default.
+            is left out. ``"all"``: all times of the ``clock``; a rate runs from the first begin to the last end of a
+            stream. A stream is zero and not observed before it begins, and not observed after its end.
+        size: (H, W) to scale the images to, ignoring their aspect ratio.
+        test_share: share of the recordings in the test split, by a hash of their names; none by default.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Attributes:
-        episodes: with the recordings' names, and their ``begin`` on their own clock.
+        episodes: episodes with the recordings' names, and their ``begin`` on the recording's clock.
         columns: names of the columns of each table.
 
     Raises:
         FileNotFoundError: without a stream's file or folder.
         ImportError: for Parquet files, without pyarrow.
-        ValueError: for another ``span``; tables that lack columns, hold what is no number, or whose times do not
-            ascend; pictures that cannot be decoded; streams without common times; recordings that differ in their
-            streams or share a name.
+        ValueError: for an unknown ``span``; tables that lack columns, have invalid numbers, or whose times do not
+            ascend; images that cannot be decoded; streams without common times; recordings that differ in their streams
+            or share a name.
         OSError: if the cache cannot be written.
 
     Examples:
@@ -240,10 +240,10 @@ def _pixels(pictures: JoinedPictures, picture: Tensor, row: Tensor) -> dict[str,
 
 
 def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | float:
-    """Checks that the recordings go together, and returns their clock.
+    """Checks that the recordings have the same streams, and returns their clock.
 
     Raises:
-        ValueError: where they do not, or the clock is none of their streams.
+        ValueError: if their streams differ, or the clock is none of them.
     """
     if not recordings:
         raise ValueError("there are no recordings; pass one, or a list of them")
@@ -278,7 +278,7 @@ def _check(recordings: Sequence[Recording], clock: str | float | None) -> str | 
 
 
 def _warn_of_lost_readings(recording: str, key: str, times: np.ndarray, rows: np.ndarray, seen: np.ndarray) -> None:
-    """Warns where few readings lie in the common time, or some share rows although the clock has one for each."""
+    """Warns if few readings are in the common time, or if readings are lost because they share a row."""
     inside = int(((times >= rows[0]) & (times <= rows[-1])).sum())
     if inside < _LITTLE * len(times):
         warnings.warn(
@@ -297,7 +297,7 @@ def _warn_of_lost_readings(recording: str, key: str, times: np.ndarray, rows: np
 
 
 def _warn_of_lost_rows(recording: str, times: Mapping[str, np.ndarray], clock: str | float, rows: np.ndarray) -> None:
-    """Warns where the clock had begun before some other stream, or went on after it."""
+    """Warns if the clock begins before, or ends after, some other stream."""
     own = [times[clock]] if isinstance(clock, str) else list(times.values())
     begin, end = rows[0] - min(of[0] for of in own), max(of[-1] for of in own) - rows[-1]
     step = float(np.median(np.diff(rows)))
@@ -315,7 +315,7 @@ def _warn_of_lost_rows(recording: str, times: Mapping[str, np.ndarray], clock: s
 def _on_clock(
     recording: Recording, streams: Mapping[str, Any], clock: str | float, span: Span
 ) -> tuple[TensorDict, float]:
-    """Returns rows of a recording, with the number of each one's picture, and the time of the first, s."""
+    """Returns rows of a recording, with the index of each row's image, and the time of the first, s."""
     taken = {
         key: stream.times if isinstance(stream, Readings) else stream["time"].numpy() for key, stream in streams.items()
     }

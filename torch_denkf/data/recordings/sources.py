@@ -1,4 +1,4 @@
-"""Columns of a table as numbers, whatever file they stand in, and its times."""
+"""Reads columns and times of a table as numbers, from text, Parquet or ROS bags."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["Numbers", "Source", "open_source", "read_numbers", "sparse_columns"]
 
 
 class Source:
-    """A table whose columns are read one by one.
+    """Base class of tables whose columns are read one by one.
 
     Attributes:
-        names: of the columns.
-        headless: whether the file has no names, so that these were given.
-        asides: names of columns that are read only where they are asked for.
+        names: names of the columns.
+        headless: whether the file has no header, so that the names were passed.
+        asides: names of columns that are read only if requested.
     """
 
     names: Sequence[str]
@@ -34,12 +34,12 @@ class Source:
         raise NotImplementedError
 
     def stamps(self, name: str) -> np.ndarray:
-        """Returns a column of times ``[n]``, dates as seconds, with the nanoseconds that another column has."""
+        """Returns a column of times ``[n]``, dates as seconds, plus the column of nanoseconds if there is one."""
         rest = nanoseconds_beside(name, self.names)
         return self.column(name) if rest is None else self.column(name) + 1e-9 * self.column(rest)
 
     def empty(self, name: str) -> np.ndarray:
-        """Marks cells that are there and hold nothing, bool ``[n]``."""
+        """Masks empty cells, bool ``[n]``."""
         return np.zeros(len(self.column(name)), bool)
 
     def cell(self, name: str, row: int) -> Any:
@@ -47,7 +47,7 @@ class Source:
         return self.column(name)[row]
 
     def place(self, row: int) -> str:
-        """Says where a row is; -1 for the table."""
+        """Returns the place of a row for messages; -1 for the table."""
         raise NotImplementedError
 
 
@@ -133,8 +133,8 @@ def open_source(file: Path, columns: Sequence[str] | None = None, topic: str | N
     """Opens a table.
 
     Args:
-        file: of a :class:`~torch_denkf.data.Table`.
-        columns: names of all columns, for a text that has none.
+        file: file of a :class:`~torch_denkf.data.Table`.
+        columns: names of all columns, for a text without a header.
         topic: of a bag.
 
     Raises:
@@ -153,11 +153,11 @@ class Numbers(NamedTuple):
     """Columns of a table.
 
     Attributes:
-        times: in the unit of the file, ``[n]``.
-        time: name of their column.
+        times: times in the unit of the file, ``[n]``.
+        time: name of the column of times.
         values: ``[n, C]``.
-        names: of the columns ``[C]``.
-        place: where a row is in the file.
+        names: names of the columns ``[C]``.
+        place: returns the place of a row in the file, for messages.
     """
 
     times: np.ndarray
@@ -173,16 +173,17 @@ def read_numbers(
     """Reads columns of a table.
 
     Args:
-        file: of a :class:`~torch_denkf.data.Table`.
-        time: name of the column of times; ``None`` for the first ascending one with a usual name, or the one of dates.
-        columns: to read; ``None`` for all others that hold numbers.
-        timeless: whether times stand elsewhere.
-        topic: of a bag.
+        file: file of a :class:`~torch_denkf.data.Table`.
+        time: name of the column of times; ``None`` for the first ascending one with a usual name, or the column of
+            dates.
+        columns: columns to read; ``None`` for all other numeric columns.
+        timeless: whether the table has no times.
+        topic: topic of a bag.
 
     Raises:
         FileNotFoundError: without the file.
         ImportError: for Parquet without pyarrow, for bags without rosbags.
-        ValueError: for columns that are not there, and values that are no finite numbers.
+        ValueError: for missing columns, and values that are no finite numbers.
     """
     source = open_source(file, columns, topic)
     there = source.names
@@ -201,7 +202,7 @@ def read_numbers(
     if columns is None or source.headless:
         columns = [name for name in (columns or there) if name not in own]
         read = {name: source.column(name) for name in columns}
-        if not source.headless:  # columns of text are left out
+        if not source.headless:  # skips columns of text
             read = {name: column for name, column in read.items() if not len(column) or np.isfinite(column).any()}
     else:
         read = {name: source.column(name) for name in columns}
@@ -265,7 +266,7 @@ def _found(source: Source, time: str | None) -> list[str]:
 
 
 def _dates(source: Source) -> list[str]:
-    """The column whose first cell is a date, where there is one such column."""
+    """Returns the column whose first cell is a date, if there is exactly one."""
     try:
         found = [name for name in source.names if seconds_of(str(source.cell(name, 0))) is not None]
     except (IndexError, NotImplementedError):  # no row, or no text

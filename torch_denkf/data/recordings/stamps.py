@@ -1,4 +1,4 @@
-"""The stamps of a log: which column has them, in which unit, and dates and pairs of numbers as seconds."""
+"""Time stamps of a log: finds their column and unit, and converts dates and pairs of numbers to seconds."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _UNITS: dict[str, Unit] = {
     **dict.fromkeys(("us", "µs", "usec", "usecs", "micros", "microseconds"), "us"),
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosec", "nanoseconds"), "ns"),
 }
-#: Names of columns of times, the best first: when a message was measured comes before when it was recorded.
+#: Names of columns of times, the best first: the time of measurement comes before the time of recording.
 _NAMES = (
     r".*header[._/ ]?stamp([._/ ]?secs?)?",
     r"time",
     r"(time|timestamp|stamp|times|t|epoch|utc|unix|date|datetime)([._ -]*(utc|unix|epoch|stamp|time|{units}))?",
     r"(?!s$)({units})|rosbagtimestamp",
 )
-_SINCE_1970: dict[Unit, float] = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # the least of each: since 1973
+_SINCE_1970: dict[Unit, float] = {"ns": 1e17, "us": 1e14, "ms": 1e11}  # smallest stamp of each unit: 1973
 
 
 def time_columns(names: Sequence[str]) -> list[str]:
@@ -49,7 +49,7 @@ def time_columns(names: Sequence[str]) -> list[str]:
 
 
 def nanoseconds_beside(time: str, names: Sequence[str]) -> str | None:
-    """The column with the nanoseconds of a column of whole seconds, as ROS writes stamps.
+    """Returns the column with the nanoseconds of a column of whole seconds, as ROS writes stamps.
 
     Examples:
         >>> nanoseconds_beside("header.stamp.secs", ["x", "header.stamp.nsecs"])
@@ -62,7 +62,7 @@ def nanoseconds_beside(time: str, names: Sequence[str]) -> str | None:
 
 
 def seconds_of(text: str) -> float | None:
-    """A date, a time of the day, or both, in s, since 1970 in UTC where there is a date; ``None`` for another text.
+    """Converts a date, a time of day, or both to s, since 1970 in UTC if there is a date; ``None`` for other text.
 
     Examples:
         >>> seconds_of("2014-03-26T15:10:23.825Z"), seconds_of("0:01:02.5"), seconds_of("12.5")
@@ -87,7 +87,7 @@ def seconds_of(text: str) -> float | None:
 
 
 def unit_of(name: str, times: np.ndarray) -> Unit:
-    """The unit of times, by the name of their column, or where they are stamps since 1970 by their size.
+    """Returns the unit of times, by the name of their column, or by the size of stamps since 1970.
 
     Examples:
         >>> unit_of("timestamp [ns]", np.zeros(1)), unit_of("time", np.array([1.4e15])), unit_of("t", np.zeros(1))
@@ -95,7 +95,7 @@ def unit_of(name: str, times: np.ndarray) -> Unit:
     """
     words = re.findall(r"[^\W\d_]+", name.lower())
     for word in reversed(words):
-        if word in _UNITS and (word != "s" or len(words) > 1):  # a column named s is another matter
+        if word in _UNITS and (word != "s" or len(words) > 1):  # a column "s" may be a distance
             return _UNITS[word]
     size = float(np.median(np.abs(times[np.isfinite(times)]))) if np.isfinite(times).any() else 0.0
     return next((unit for unit, least in _SINCE_1970.items() if size > least), "s")

@@ -1,4 +1,4 @@
-"""The streams of a log: topics of a bag, or columns of a file that change together; and what is odd in each."""
+"""Finds the streams of a log, topics of a bag or columns of a file that change together, and their oddities."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from torch_denkf.diagnosis.logs import repeats
 
 __all__ = ["Stream", "streams_of"]
 
-_TOGETHER = 0.8  # of the changes of one column another has, too, that is written by the same sensor
-_GAP = 10  # usual steps
-_BURST = 0.1  # usual steps
+_TOGETHER = 0.8  # share of common changes from which two columns belong to the same sensor
+_GAP = 10  # median steps
+_BURST = 0.1  # median steps
 _NAMES = {"latitude": "gps", "east": "position", "turn rate": "imu", "acceleration": "imu", "speed": "speed"}
 _PARTNERS = {"latitude": "longitude", "longitude": "latitude", "east": "north", "north": "east"}
-_TURNS, _GRAVITY = 7.0, (5.0, 20.0)  # rad/s that no robot has; m/s^2 between which the size of an acceleration lies
+_TURNS, _GRAVITY = 7.0, (5.0, 20.0)  # rad/s beyond any robot; range of the median acceleration's norm, m/s^2
 
 
 class Stream(NamedTuple):
     """A stream of a log.
 
     Attributes:
-        table: reads it.
-        readings: what was read.
-        repeated: the share of rows that repeat a reading.
+        table: table that reads it.
+        readings: readings of the table.
+        repeated: share of rows that repeat a reading.
         others: columns of numbers of its file that are in no stream; with the first stream of the file.
     """
 
@@ -41,11 +41,11 @@ class Stream(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Readings a second."""
+        """Returns the number of readings per second."""
         return 1 / float(np.median(np.diff(self.readings.times))) if len(self.readings.times) > 1 else 0.0
 
     def oddities(self) -> list[str]:
-        """Says what is odd: repeats, gaps, bursts, outliers, and units that look wrong."""
+        """Returns texts about oddities: repeats, gaps, bursts, outliers, and units that look wrong."""
         times, out = self.readings.times, []
         steps = np.diff(times)
         usual = float(np.median(steps)) if len(steps) else 0.0
@@ -77,11 +77,11 @@ def streams_of(*files: str | Path, **options) -> dict[str, Stream]:
     """Finds the streams of a log.
 
     Args:
-        *files: of :class:`~torch_denkf.data.Table`; their times are of one clock.
-        **options: of the tables, such as ``time`` and ``unit``.
+        *files: files of :class:`~torch_denkf.data.Table`, with times of one clock.
+        **options: options of the tables, such as ``time`` and ``unit``.
 
     Returns:
-        The streams by name: topics, or names of sensors by what their columns mean.
+        Streams by name: topics, or names of sensors by the quantities of their columns.
 
     Raises:
         FileNotFoundError: without the file.
@@ -106,7 +106,7 @@ def _of_file(path: Path, **options) -> dict[str, Stream]:
             table = Table(path, topic=topic, **options)
             try:
                 found[topic] = Stream(table, table.read(), 0.0)
-            except ValueError:  # a topic of pictures or text
+            except ValueError:  # a topic of images or text
                 continue
         return found
     full, sparse = sparse_columns(path, options.get("time"))
@@ -160,7 +160,7 @@ def _together(table: Readings) -> list[list[str]]:
 
 
 def _by_sensor(names: list[str]) -> list[list[str]]:
-    """Columns of each row by what they are: inertial and unknown ones, speeds, and poses."""
+    """Groups columns by sensor: inertial and unknown ones, speeds, and poses."""
     speeds = [name for name in names if quantity(name) == "speed"]
     poses = [name for name in names if quantity(name) in ("heading", "east", "north", "latitude", "longitude")]
     return [[name for name in names if name not in (*speeds, *poses)], speeds, poses]

@@ -1,4 +1,4 @@
-"""Readings in tables, text, Parquet or a topic of a ROS bag: a time and some numbers a row."""
+"""Tables of readings, from text, Parquet or a topic of a ROS bag: each row has a time and values."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Readings(NamedTuple):
     """Content of a table.
 
     Attributes:
-        times: when they were taken, s, ascending, ``[n]``.
+        times: measurement times, s, ascending, ``[n]``.
         values: ``[n, C]``.
         columns: names of the values.
-        arrived: when they could be read, s, ``[n]``; None where that is when they were taken.
-        until: s, the table's end, where it repeats the last reading up to there.
+        arrived: arrival times, s, ``[n]``; None if they equal the measurement times.
+        until: time of the last row, s, if the table repeats its last reading up to there.
     """
 
     times: np.ndarray
@@ -42,47 +42,47 @@ class Table:
     r"""Readings of a sensor, states or commands, from a text or Parquet file, or a topic of a ROS bag.
 
     Text may be separated by commas, semicolons, tabs, bars or blanks. Lines that begin with ``#``, ``%``, ``@`` or
-    ``//`` are comments, of which the last above the numbers may name the columns. Files in the forms of TUM and KITTI,
-    which have no header, get the names ``time, tx, ty, tz, qx, qy, qz, qw`` and ``r00, r01, r02, x, ...``. A name that
-    comes twice becomes ``NAME.1``. Rows whose columns are all empty are no readings.
+    ``//`` are comments, the last of which above the numbers may name the columns. Files in the formats of TUM and
+    KITTI, which have no header, get the names ``time, tx, ty, tz, qx, qy, qz, qw`` and ``r00, r01, r02, x, ...``. A
+    repeated name becomes ``NAME.1``. Rows whose columns are all empty are no readings.
 
     Args:
         file: ends in ``.parquet``; in ``.bag``, ``.db3`` or ``.mcap``, or is a folder, for a ROS bag, which needs
             ``pip install 'torch_denkf[ros]'``; all else is text.
-        columns: names of the columns to read, in this order; by default all numbers but the times. Where the file has
-            no header: names of all its columns, that of the time included.
-        time: name of the column of times, when each reading was taken; they ascend. They are numbers, dates, or whole
-            seconds, where another column has the nanoseconds. By default the first ascending column with a usual name,
-            such as ``time``, ``timestamp`` or ``header.stamp.secs``.
-        arrived: name of a column of times at which the readings arrived, on the same clock, where they come late. A row
-            of the data set shows the last one that had arrived, and ``NAME_late`` says by how many rows it is late, as
-            :class:`~torch_denkf.fusion.FusedSensor` reads it. With ``sample="last"`` alone.
-        unit: of the times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``. By default as the column's name says, such as
-            ``timestamp [ns]``; or the size of stamps since 1970; else ``"s"``.
-        times: when each row was read, where the table does not say: another file with one row each, or the times.
-        topic: of a ROS bag; it may have one alone that is read by default. Columns are the fields of its messages, such
-            as ``twist.twist.linear.x``, numbered in arrays.
-        offset: in s, added to all times, such as -0.7 for readings that are stamped 0.7 s late. It is found by
-            :func:`~torch_denkf.data.clock_offsets`.
-        sample: which reading a row of the data set gets. ``"last"``: the last one up to then, held until the next.
-            These two look into the future: ``"nearest"``, the nearest in time, before or after; ``"linear"``, straight
-            lines between the readings before and after (unwrap angles first).
-        tolerance: in s. With ``"last"`` and ``"nearest"``, readings that are farther away count as missing: by
-            default, none with ``"last"``, half a row's time with ``"nearest"``. With ``"linear"``, no value between
-            readings that are farther apart; by default there always is one.
-        origin: what is subtracted from columns, by their names, in float64, before they become float32, which has seven
-            digits: of metres of a map, degrees of latitude or encoder ticks the last ones are lost. A warning says
+        columns: names of the columns to read, in this order; by default all numeric columns except the times. For a
+            file without a header: names of all its columns, including the time.
+        time: name of the column with the measurement times, ascending. They are numbers, dates, or whole seconds with
+            the nanoseconds in another column. By default the first ascending column with a usual name, such as
+            ``time``, ``timestamp`` or ``header.stamp.secs``.
+        arrived: name of a column with the arrival times of delayed readings, on the same clock. A row of the data set
+            has the last reading that had arrived, and ``NAME_late`` is its latency in rows, an input of
+            :class:`~torch_denkf.fusion.FusedSensor`. Only with ``sample="last"``.
+        unit: of the times: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``. By default from the column's name, such as
+            ``timestamp [ns]``; or from the size of stamps since 1970; else ``"s"``.
+        times: times of the rows, for a table without times: another file with as many rows, or an array.
+        topic: topic of a ROS bag; by default the only one. Columns are the fields of its messages, such as
+            ``twist.twist.linear.x``, numbered in arrays.
+        offset: in s, added to all times, such as -0.7 for readings that are stamped 0.7 s late.
+            :func:`~torch_denkf.data.clock_offsets` estimates it.
+        sample: interpolation to the rows of the data set. ``"last"``: the last reading up to the row's time, a
+            zero-order hold, with a delay of up to one row. The other two use future readings: ``"nearest"``, the
+            nearest in time, for smoothing; ``"linear"``, linear interpolation (unwrap angles first).
+        tolerance: in s. With ``"last"`` and ``"nearest"``, readings that are farther away count as missing: by default
+            no limit with ``"last"``, half a row's time with ``"nearest"``. With ``"linear"``, there is no value between
+            readings that are farther apart; by default there is no limit.
+        origin: offsets that are subtracted from columns, by name, in float64, before the conversion to float32, which
+            has seven digits: metres of a map, degrees of latitude or encoder ticks lose their last ones. A warning says
             where.
-        local: latitude and longitude in degrees, and height in m or none of it, of the origin of a local frame: columns
-            of latitude and longitude, and perhaps of height, in this order, become metres ``east``, ``north`` and
-            ``up`` of it, see :mod:`torch_denkf.data.earth`.
-        repeats: what a row is in which no column differs from the row before. ``"drop"``: the last reading once more,
-            as in a log that repeats a slow sensor until it reads again; the row is left out. ``"keep"``: a reading of
-            its own. By default it is kept, and a warning says where a column looks as if it repeats.
+        local: latitude and longitude in degrees, and optionally the height in m, of the origin of a local frame:
+            columns of latitude, longitude and optionally height, in this order, become metres ``east``, ``north`` and
+            ``up``, see :mod:`torch_denkf.data.earth`.
+        repeats: treatment of rows that equal the row before. ``"drop"`` leaves them out, for a log that repeats the
+            last reading of a slow sensor. ``"keep"`` takes them for new readings. The default keeps them, and warns of
+            columns that look repeated.
 
     Raises:
         ValueError: for an unknown ``unit``, ``sample`` or ``repeats``, tolerances that are not positive, an ``offset``
-            that is no time, and ``arrived`` beside another ``sample`` than ``"last"``.
+            that is not finite, and ``arrived`` with a ``sample`` other than ``"last"``.
 
     Examples:
         >>> from tempfile import mkdtemp
@@ -128,8 +128,8 @@ class Table:
         Raises:
             FileNotFoundError: without the file.
             ImportError: for Parquet, without pyarrow.
-            ValueError: for columns that are not there, values that are no finite numbers, times that do not ascend, and
-                readings that arrive before they are taken; names the file, the line and the column.
+            ValueError: for missing columns, values that are no finite numbers, times that do not ascend, and readings
+                that arrive before they are taken; the message names the file, the line and the column.
         """
         if self.columns is not None and not isinstance(self.columns, Sequence):
             raise TypeError(f"columns is a list of names, or None; got {self.columns!r}")
@@ -176,10 +176,10 @@ class Table:
 
 
 def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str | None) -> None:
-    """Raises for options that no stream has.
+    """Checks the options of a stream.
 
     Raises:
-        ValueError: if there is one.
+        ValueError: for an unknown or invalid option.
     """
     if sample not in ways:
         raise ValueError(f"sample is one of {', '.join(map(repr, ways))}, got {sample!r}")
@@ -190,15 +190,15 @@ def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit
 
 
 def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> None:
-    """Raises for times that stand still or go back.
+    """Checks that times increase.
 
     Args:
         times: s, ``[n]``.
-        place: where a row is, for a message.
-        column: name of their column.
+        place: returns the place of a row, for a message.
+        column: name of the column of times.
 
     Raises:
-        ValueError: if there are none, or one is not finite or does not ascend.
+        ValueError: if there are none, one is not finite, or they do not ascend.
     """
     if not len(times):
         raise ValueError(f"{place(-1)} has no rows; leave the stream out")
@@ -217,17 +217,17 @@ def check_times(times: np.ndarray, place: Callable[[int], str], column: str) -> 
 def given_times(
     given: str | Path | Sequence[float], column: str | None, source: str, count: int, what: str
 ) -> tuple[np.ndarray, Callable[[int], str]]:
-    """Times that stand beside what they belong to, in their own unit, and where each is, for messages.
+    """Returns times that were passed as a file or array, in their own unit, and the place of each, for messages.
 
     Args:
-        given: a table with a row each, or the times.
-        column: of that table.
-        source: what they belong to.
-        count: how many it has.
-        what: names them.
+        given: file with a row for each time, or the times.
+        column: column of times in that file.
+        source: name of the stream, for messages.
+        count: number of the stream's elements.
+        what: name of these elements.
 
     Raises:
-        ValueError: if they are not as many.
+        ValueError: if there are not ``count`` times.
     """
     if isinstance(given, (str, Path)):
         read = read_numbers(Path(given).expanduser(), column, [])

@@ -1,4 +1,4 @@
-"""The form of a table in a text file: comments, separator, names of its columns, cells."""
+"""Parses tables in text files: comments, separator, names of columns, cells."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Cells(NamedTuple):
     """A table as text.
 
     Attributes:
-        names: of the columns.
-        rows: the cells of each row, which may be too few.
-        lines: of the file, in which the rows end.
+        names: names of the columns.
+        rows: cells of each row, which may be too few.
+        lines: line of the file at which each row ends.
         headless: whether the file does not name its columns.
     """
 
@@ -40,12 +40,12 @@ class Cells(NamedTuple):
 
 
 def read_cells(file: Path, columns: Sequence[str] | None = None) -> Cells:
-    """Reads a text file, whatever separates its columns.
+    """Reads a table from a text file with any separator.
 
     Args:
         file: a text in UTF-8. Lines that begin with ``#``, ``%``, ``@`` or ``//`` are comments; the last of them above
-            the numbers names the columns where it has as many cells.
-        columns: names of all columns, for a file that has none of its own.
+            the numbers names the columns if it has as many cells.
+        columns: names of all columns, for a file without a header.
 
     Raises:
         FileNotFoundError: without the file.
@@ -91,7 +91,7 @@ _SAID = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "ba
 
 
 def _separator(head: str) -> str:
-    """The separator of the first line; blanks where there is no other."""
+    """Returns the separator of the first line; a blank if there is no other."""
     for mark in ("\t", ";", ",", "|"):
         if mark in head and not (mark == "\t" and "" in map(str.strip, head.strip().split("\t"))):
             return mark
@@ -99,7 +99,7 @@ def _separator(head: str) -> str:
 
 
 def _split(file: Path, lines: Sequence[str], mark: str) -> tuple[list[list[str]], list[int]]:
-    """The cells of all lines that have any, and the line at which each row ends."""
+    """Returns the cells of all lines that are not empty, and the line at which each row ends."""
     rows, ends = [], []
     if mark == " ":
         for place, line in enumerate(lines):
@@ -119,21 +119,21 @@ def _split(file: Path, lines: Sequence[str], mark: str) -> tuple[list[list[str]]
 
 
 def _pointed(cell: str) -> str:
-    """A number with a decimal comma, as files have it whose columns are separated by semicolons, with a point."""
+    """Replaces a decimal comma by a point, for files whose columns are separated by semicolons."""
     return re.sub(r"^(\s*[-+]?\d+),(\d+)", r"\1.\2", cell)
 
 
 def _is_head(row: Sequence[str]) -> bool:
-    """Tells names of columns, or units, from a row of numbers, dates and what is missing."""
+    """Returns True for a row of names or units, which has no number, date or NaN."""
     filled = [cell for cell in map(str.strip, row) if cell]
     return not any(is_number(cell) or cell.lower() == "nan" or seconds_of(cell) is not None for cell in filled)
 
 
 def _named(file: Path, row: Sequence[str], comment: Sequence[str], columns: Sequence[str] | None) -> Sequence[str]:
-    """Names of the columns of a file without a header.
+    """Returns names of the columns of a file without a header.
 
     Raises:
-        ValueError: if nothing says them.
+        ValueError: if the names are unknown.
     """
     count = len(row) if row[-1].strip() else len(row) - 1
     if columns is not None and len(columns) == count:
@@ -154,7 +154,7 @@ def _named(file: Path, row: Sequence[str], comment: Sequence[str], columns: Sequ
 
 
 def numbered(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of columns, of which those that come again get a number, as pandas has them.
+    """Returns names of columns, in which repeated names get a number, as in pandas.
 
     Examples:
         >>> numbered(["t", "x", "x"])
@@ -169,7 +169,7 @@ def numbered(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def as_number(text: str) -> float:
-    """A finite number that float32 can hold; NaN for what is none."""
+    """Returns a finite number in the range of float32; NaN for other text."""
     try:
         number = read_number(text)
     except ValueError:
@@ -178,5 +178,5 @@ def as_number(text: str) -> float:
 
 
 def is_number(text: str) -> bool:
-    """Tells whether a text is a finite number."""
+    """Returns True if a text is a finite number."""
     return not math.isnan(as_number(text))

@@ -1,1 +1,1 @@
-"""Fast forms of formulas: small systems written out, random bits, shards of an ensemble."""
+"""Fast implementations of formulas: small systems written out, random bits, shards of an ensemble."""

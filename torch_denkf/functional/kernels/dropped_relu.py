@@ -1,4 +1,4 @@
-"""ReLU and dropout in one, whose backward pass needs the result alone."""
+"""ReLU and dropout in one function, whose backward pass needs only the result."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ __all__ = ["dropped_relu"]
 def dropped_relu(x: Tensor, factor: Tensor, rate: float) -> Tensor:
     """Applies ReLU, then dropout: ``relu(x) * factor``.
 
-    What is neither cut off nor dropped is the result where it is positive, and its derivative is 1 / (1 - rate). The
-    next layer keeps the result anyway, so that no masks are kept for the backward pass; storing those costs a chunk
-    that inductor compiled (torch 2.13, on a processor) more than its products of matrices.
+    Where the result is positive, its derivative is 1 / (1 - rate); elsewhere it is zero. The next layer stores the
+    result anyway, so no masks are stored for the backward pass; in a chunk compiled by inductor (torch 2.13, on a
+    processor) storing them costs more than the matrix products.
 
     Args:
         x: output of a linear layer, any shape.
-        factor: 0 or 1 / (1 - rate), of that shape, from
+        factor: 0 or 1 / (1 - rate), of the shape of ``x``, from
             :func:`~torch_denkf.functional.kernels.random_bits.dropout_factor`.
         rate: drop probability in [0, 1).
 
@@ -41,7 +41,7 @@ class _DroppedReLU(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, factor: Tensor, kept: float) -> Tensor:
-        # Traced, nothing is changed in place: of tensors on CUDA the saved result lost its gradient (torch 2.11).
+        # Not in place while tracing: on CUDA the saved result lost its gradient (torch 2.11).
         return (x * factor).relu() if torch.compiler.is_compiling() else (x * factor).relu_()
 
     @staticmethod
@@ -58,7 +58,7 @@ class _DroppedReLU(torch.autograd.Function):
 
 
 class _WithForwardMode(_DroppedReLU):
-    """Apart, because dynamo takes no function that has a ``jvp``."""
+    """Adds forward mode, in a separate class because dynamo rejects functions that have a ``jvp``."""
 
     @staticmethod
     def setup_context(ctx, inputs: tuple, output: Tensor) -> None:

@@ -1,8 +1,8 @@
 """Bernoulli masks from few random bits.
 
-A dropout mask needs one decision a unit, not one floating-point number. Eight decisions come out of one
-64-bit draw: each of its bytes is compared with a threshold. At the sizes of a filter step this is several
-times cheaper than :func:`torch.nn.functional.dropout`, whose masks are two thirds of such a step.
+A dropout mask needs one decision per unit, not one floating-point number. One 64-bit draw gives eight decisions: each
+of its bytes is compared with a threshold. At the sizes of a filter step this is several times cheaper than
+:func:`torch.nn.functional.dropout`, whose masks take two thirds of such a step.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def random_bytes(
 
     Args:
         shape: shape of the result.
-        device: where to draw.
+        device: device of the result.
         generator: source of randomness; torch's global one by default.
 
     Returns:
@@ -63,13 +63,13 @@ def random_bytes(
     """
     size = prod(shape)
     count = (size + 7) // 8
-    if torch.compiler.is_exporting():  # random_() over the whole range cannot be written into a graph: one number less
+    if torch.compiler.is_exporting():  # random_() over the whole range cannot be exported, so the range is one smaller
         words = torch.randint(_INT64_MIN, -_INT64_MIN - 1, (count,), device=device)
     else:
         try:
             words = torch.empty(count, dtype=torch.int64, device=device)
             words.random_(_INT64_MIN, None, generator=generator)
-        except RuntimeError:  # under torch.vmap only what is made there can differ from row to row
+        except RuntimeError:  # under torch.vmap only tensors created there can differ between rows
             words = torch.randint(_INT64_MIN, -_INT64_MIN - 1, (count,), device=device, generator=generator)
     return words.view(torch.uint8)[:size].view(tuple(shape))
 
@@ -82,17 +82,17 @@ def balanced_bytes(
     device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draws bytes that each unit's members have without replacement, so that it is dropped in the same share of them.
+    """Draws bytes without replacement across each unit's members, so that dropout drops equally many for all units.
 
-    Each byte by itself is uniform in 0 to 255, and bytes of different units are independent. Those of one unit lie
-    256 / E apart, in an order of their own: of E members floor(rate E) or one more are dropped. An ensemble's mean is
-    then nearer to what infinitely many members would have than with independent bytes, at a few random bits.
+    Each single byte is uniform in 0 to 255, and bytes of different units are independent. The bytes of one unit are
+    256 / E apart, in random order: of E members floor(rate E) or one more are dropped. So the ensemble's mean is
+    nearer to the mean of infinitely many members than with independent bytes, for a few more random bits.
 
     Args:
         batch_size: ``[*B]``.
         members: E.
         units: H, of all layers.
-        device: where to draw.
+        device: device of the result.
         generator: source of randomness; torch's global one by default.
 
     Returns:
@@ -112,13 +112,13 @@ def balanced_bytes(
 
 
 def _orders(members: int, device: torch.device) -> torch.Tensor:
-    """Returns the orders in which bytes of one unit can stand, ``[N, E]``, or one ``[E, 1]`` for its multiples."""
+    """Returns the possible orders of one unit's bytes, ``[N, E]``, or one ``[E, 1]`` to be multiplied."""
 
     def make() -> torch.Tensor:
         number = torch.arange(members)
         if 256 % members == 0:
             orders = number.unsqueeze(-1)
-        else:  # ranks of the multiples of different angles: any two members lie any distance apart
+        else:  # ranks of multiples of different angles, which give any two members all distances
             angles = torch.arange(1, max(2, min(257, 2**22 // members)), dtype=torch.float64) * _GOLDEN
             orders = (angles.unsqueeze(-1) * number % 1).argsort(-1).argsort(-1)
         return (orders * 256 // members).to(torch.uint8).to(device)
@@ -127,15 +127,15 @@ def _orders(members: int, device: torch.device) -> torch.Tensor:
 
 
 def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torch.Tensor:
-    """Turns random bytes, or a mask of kept units, into what dropout multiplies with: 0, or 1 / (1 - rate) if kept.
+    """Turns random bytes, or a mask of kept units, into dropout factors: 0, or 1 / (1 - rate) if kept.
 
-    A byte b is kept where ``b >= 256 * rate``. Written as a line in b that is cut off at both values, it runs in wide
-    registers, which comparisons of bytes and products with booleans do not: that is half of what dropout costs.
+    A byte b is kept if ``b >= 256 * rate``. As a line in b, clamped at both values, this is vectorised, which
+    comparisons of bytes and products with booleans are not: they take half of the time of dropout.
 
     Args:
         draws: uint8 of :func:`random_bytes`, or boolean, ``True`` where kept.
         rate: drop probability, a multiple of 1/256 (see :func:`representable_rate`).
-        dtype: of the result.
+        dtype: dtype of the result.
 
     Returns:
         Factors of the shape of ``draws``.
@@ -149,8 +149,8 @@ def dropout_factor(draws: torch.Tensor, rate: float, dtype: torch.dtype) -> torc
         draws = draws >= round(256 * rate)
     if draws.dtype == torch.bool:
         return draws * kept if dtype == torch.get_default_dtype() else draws.to(dtype) * kept
-    # From byte to byte the line rises by 1024, more than twice the largest factor (256): at the first byte that is
-    # kept it stands at twice the factor, at the one before below zero, whatever the rounding. So the ends are exact.
+    # Per byte the line rises by 1024, more than twice the largest factor (256): at the first kept byte it is twice
+    # the factor, at the byte before it is negative, whatever the rounding. So the clamped values are exact.
     line = draws.to(torch.promote_types(dtype, torch.float32))  # a copy, so in place from here
     return line.mul_(1024).add_(2 * kept - 1024 * round(256 * rate)).clamp_(0.0, kept).to(dtype)
 

@@ -1,4 +1,4 @@
-r"""Inverse square roots of matrices without eigenvalues, whose decomposition waits for a GPU.
+r"""Inverse square roots of matrices without an eigendecomposition, which would synchronise with a GPU.
 
 The integral :math:`A^{-1/2} = \frac{2}{\pi} \int_0^\infty (t^2 + A)^{-1} dt` by the rule of Hale, Higham & Trefethen
 (2008, "Computing A^α, log(A), and related matrix functions by contour integrals", SIAM J. Numer. Anal. 46, method 3):
@@ -19,8 +19,8 @@ from torch_denkf.functional.kernels.small_system import inverse_of, made_once
 def nodes(count: int, ratio: float) -> list[tuple[float, float]]:
     """Returns shifts s and weights w with x^-1/2 ≈ Σ w / (x + s) for x in [1, ratio].
 
-    The nodes are equidistant in the argument of Jacobi's sc of modulus sqrt(1 - 1 / ratio), which is a quotient of
-    theta functions, of few terms in its lower half; the upper half mirrors it.
+    The nodes are equidistant in the argument of Jacobi's sc of modulus sqrt(1 - 1 / ratio), a quotient of theta
+    functions that converges fast in the lower half; the upper half mirrors it.
 
     Examples:
         >>> round(sum(weight / (100 + shift) for shift, weight in nodes(18, 2.0**23)), 7)
@@ -52,14 +52,14 @@ def _agm(a: float, b: float) -> float:
 def sum_of_resolvents(matrix: Tensor, *, difference: bool) -> Tensor:
     """Computes (I + M)^-1/2, or M⁻¹ ((I + M)^-1/2 − I), of a symmetric positive semi-definite M.
 
-    The latter has the same nodes, and nothing cancels: its weights are −w / (1 + s).
+    The latter has the same nodes and the weights −w / (1 + s), without cancellation.
 
     Args:
         matrix: M, ``[*B, N, N]``; its eigenvalues are exact to rounding up to 1 / eps of its precision.
-        difference: which of the two.
+        difference: whether to compute the latter.
 
     Returns:
-        ``[*B, N, N]``; NaN where I + M is not positive definite.
+        ``[*B, N, N]``; NaN if I + M is not positive definite.
 
     Examples:
         >>> sum_of_resolvents(torch.tensor([[3.0, 0.0], [0.0, 8.0]]), difference=False).diagonal().round(decimals=4)
@@ -71,10 +71,10 @@ def sum_of_resolvents(matrix: Tensor, *, difference: bool) -> Tensor:
 
 
 def _table(like: Tensor) -> Tensor:
-    """Returns shifts, weights, and those of the difference, ``[3, J]``."""
+    """Returns shifts, weights, and weights of the difference, ``[3, J]``."""
 
     def make() -> Tensor:
-        count = 22 if like.dtype == torch.float32 else 80  # as the difference needs near M = 0
+        count = 22 if like.dtype == torch.float32 else 80  # the difference needs that many near M = 0
         found = [(s, w, -w / (1 + s)) for s, w in nodes(count, 1 / torch.finfo(like.dtype).eps)]
         return torch.tensor(found, dtype=like.dtype, device=like.device).mT.contiguous()
 

@@ -1,4 +1,4 @@
-"""The measurement update of an ensemble whose columns lie in several processes."""
+"""The measurement update of an ensemble whose columns are distributed over several processes."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def analyse_sharded(
 ) -> Analysis:
     """Runs :func:`~torch_denkf.functional.analyse` for a state too large for one process.
 
-    Every process holds all members of some components of the state, and of some components of the observation. In
-    ensemble space the analysis needs of the others only sums over components: YYᵀ, E x E, and Y times the members'
-    innovations, E x E (E x 1 for ``"etkf"``). They are added up in one all-reduce, in double precision; then each
-    process moves its own components.
+    Every process has all members of some components of the state, and of some components of the observation. In
+    ensemble space the analysis needs from the other processes only sums over components: YYᵀ, E x E, and Y times the
+    members' innovations, E x E (E x 1 for ``"etkf"``). One all-reduce adds them in double precision; then each process
+    updates its own components.
 
-    All processes must call this together, with the same members, batch, scheme and dtype. No gradients. Without a
-    process group this process holds everything.
+    All processes must call this together, with the same members, batch, scheme and dtype. There are no gradients.
+    Without a process group this process has all components.
 
     Args:
         forecast: this process's components, ``[*B, E, S_r]``.
@@ -42,22 +42,22 @@ def analyse_sharded(
         noise: their variances, ``[*B, O_r]``.
         scheme: as in :func:`~torch_denkf.functional.analyse`.
         observed: boolean, ``[*B, 1]`` or ``[*B, O_r]``.
-        perturbation: standard normal draws for ``"perturbed"``, ``[*B, E, O_r]``; other ones in each process.
+        perturbation: standard normal draws for ``"perturbed"``, ``[*B, E, O_r]``; different ones in each process.
         rotation: for ``"etkf"``, ``[*B, E, E]``; the same in all processes.
-        group: the processes; ``None`` for all.
+        group: the process group; ``None`` for all processes.
 
     Returns:
         The :class:`~torch_denkf.functional.analysis.Analysis`: ensemble and innovation of this process's components;
         ``nis`` and ``log_likelihood`` of all components.
 
     Raises:
-        RuntimeError: if ``torchrun`` started several processes and no process group was begun, or a tensor requires a
+        RuntimeError: if ``torchrun`` started several processes without a process group, or a tensor requires a
             gradient.
         ValueError: as in :func:`~torch_denkf.functional.analyse`, and for ``"perturbed"`` without ``perturbation``:
-            processes that begin with the same seed would draw the same numbers for other components.
+            processes with equal seeds would draw equal numbers for different components.
 
     Examples:
-        One process, which holds everything; ``torchrun`` starts more.
+        With one process, which has all components; ``torchrun`` starts more.
 
         >>> import torch
         >>> ensemble = torch.tensor([[-1.0], [1.0]])
@@ -69,7 +69,7 @@ def analyse_sharded(
         forecast, predicted, observation, noise, scheme, observed, perturbation, rotation, None, None, "ensemble"
     )
     if scheme == "perturbed" and perturbation is None:
-        raise ValueError("scheme 'perturbed' needs perturbation: draw it with another seed in each process")
+        raise ValueError("scheme 'perturbed' needs perturbation: draw it with a different seed in each process")
     given = {"forecast": forecast, "predicted": predicted, "observation": observation, "noise": noise}
     for name, tensor in given.items():
         if torch.is_grad_enabled() and tensor.requires_grad:
@@ -77,7 +77,7 @@ def analyse_sharded(
     begun = dist.is_initialized()
     if not begun and int(os.environ.get("WORLD_SIZE", 1)) > 1:
         raise RuntimeError(
-            f"torchrun started {os.environ['WORLD_SIZE']} processes, which do not know of each other yet: call "
+            f"torchrun started {os.environ['WORLD_SIZE']} processes, which are not connected yet: call "
             "torch.distributed.init_process_group() first"
         )
 

@@ -1,9 +1,9 @@
-"""Cholesky factors and solutions of a few unknowns written out, for compilers: they melt into what is around them.
+"""Cholesky factors and solutions of small systems, element by element, which compilers can fuse with other code.
 
-In a compiled step LAPACK's calls for a 2 x 2 system cost more than the system: they cannot be fused, each costs a
-call, and in C++ (a filter's ``compile()`` on a processor, a package of AOTInductor) some go through a slow fallback.
-Eagerly, LAPACK is the faster one on a processor. On a GPU, torch's routines for batches of systems wait for the device,
-or cannot be captured into a CUDA graph, as MAGMA's: :func:`inverse_of` takes their place there.
+In a compiled step LAPACK's calls for a 2 x 2 system cost more than its arithmetic: they cannot be fused, each has an
+overhead, and in C++ (a filter's ``compile()`` on a processor, a package of AOTInductor) some take a slow fallback.
+In eager mode on a processor LAPACK is faster. On a GPU, torch's routines for batches of systems synchronise with the
+device, or cannot be captured into a CUDA graph, as MAGMA's: :func:`inverse_of` replaces them there.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from contextlib import suppress
 import torch
 from torch import Tensor
 
-#: The largest O that is written out; the number of operations grows with its cube.
+#: The largest O of systems that are written out; the number of operations grows with its cube.
 LARGEST = 4
-#: The largest matrix whose factor alone is written out, of a state's covariance, say.
+#: The largest matrix for which only the factor is written out, such as a state's covariance.
 LARGEST_FACTOR = 6
-#: The largest system whose rows a compiler is to see eliminated, one after the other.
+#: The largest system that is solved by elimination, row by row, under a compiler.
 LARGEST_ELIMINATED = 12
-#: Kinds of devices on which a call costs a launch, and a look at a result waits for all launches before it.
+#: Devices on which each call is a kernel launch, and reading a value waits for all launches before it.
 GPUS = ("cuda",)
 
 
@@ -28,47 +28,47 @@ _MADE: dict[Hashable, Tensor] = {}
 
 
 def made_once(key: Hashable, make: Callable[[], Tensor]) -> Tensor:
-    """Returns a constant tensor that is made in the first call: no copy to the device is captured into a graph later.
+    """Returns a constant tensor, created in the first call, so that no later graph captures a copy to the device.
 
-    A tensor that holds no numbers, as compilers trace with, is not kept.
+    A tensor without values, as compilers trace with, is not cached.
 
     Args:
-        key: of the constant; its device among it.
-        make: makes it.
+        key: key of the constant, which includes its device.
+        make: creates the constant.
     """
     if key in _MADE:
         return _MADE[key]
     made = make()
     if type(made) is Tensor and not torch.compiler.is_compiling() and not torch.compiler.is_exporting():
         with suppress(NotImplementedError, RuntimeError), torch.inference_mode(False):
-            made.untyped_storage()  # torch.func's wrappers, of one call alone, have none
-            _MADE[key] = made = made.clone()  # no gradient may meet what inference mode made
+            made.untyped_storage()  # torch.func's wrappers, valid in one call only, have none
+            _MADE[key] = made = made.clone()  # tensors of inference mode cannot be used with gradients
     return made
 
 
 def on_gpu(tensor: Tensor) -> bool:
-    """Tells whether routines that wait for the device, or cannot be captured into a graph, are to be avoided."""
+    """Tells whether to avoid routines that wait for the device, or cannot be captured into a graph."""
     return tensor.device.type in GPUS
 
 
 def identity_of(matrix: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Returns the identity ``[N, N]`` beside matrices ``[*B, N, N]``; not to be written to."""
+    """Returns the identity ``[N, N]`` for matrices ``[*B, N, N]``; it is shared, so do not write to it."""
     size, dtype, device = matrix.shape[-1], dtype or matrix.dtype, matrix.device
     return made_once(("identity", size, dtype, device), lambda: torch.eye(size, dtype=dtype, device=device))
 
 
 def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
-    """Returns the inverse of a symmetric M, N x N, and log det M, in few launches and without a look at the numbers.
+    """Returns the inverse of a symmetric M, N x N, and log det M, in few launches and without reading values.
 
-    Up to :data:`LARGEST` rows of M and of the identity are eliminated one after the other, for a compiler up to
-    :data:`LARGEST_ELIMINATED`; larger matrices are factored.
+    Up to :data:`LARGEST` rows, and under a compiler up to :data:`LARGEST_ELIMINATED`, are eliminated one after the
+    other; larger matrices are factored.
 
     Args:
         matrix: M, ``[*B, N, N]``, with both triangles.
-        ridge: is added to the diagonal.
+        ridge: number added to the diagonal.
 
     Returns:
-        M⁻¹, ``[*B, N, N]``, and log det M, ``[*B, 1]``. NaN where M is not positive definite.
+        M⁻¹, ``[*B, N, N]``, and log det M, ``[*B, 1]``. NaN if M is not positive definite.
 
     Examples:
         >>> inverse, log_det = inverse_of(torch.tensor([[2.0, 1.0], [1.0, 1.0]]))
@@ -85,7 +85,7 @@ def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
         root = torch.linalg.solve_triangular(factor, identity, upper=False)
         return root.mT @ root, 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
     rest, rows, pivots = torch.cat([matrix, identity], -1), [], []
-    for _ in range(size):  # what is left of the table has one row and one column less each time
+    for _ in range(size):  # the remaining table has one row and one column less each time
         pivots.append(torch.threshold(rest[..., :1, :1], 0, torch.nan))
         rows.append(rest[..., :1, 1:] * pivots[-1].rsqrt())
         if rest.shape[-2] > 1:
@@ -96,18 +96,18 @@ def inverse_of(matrix: Tensor, ridge: float = 0) -> tuple[Tensor, Tensor]:
 
 
 def is_written_out(matrix: Tensor, largest: int = LARGEST) -> bool:
-    """Tells whether a compiler is to see a system of one to ``largest`` unknowns written out."""
+    """Tells whether a system of one to ``largest`` unknowns is to be written out: only under a compiler."""
     return torch.compiler.is_compiling() and 0 < matrix.shape[-1] <= largest
 
 
 class WrittenOut:
-    """The Cholesky factor L of a symmetric matrix M, N x N, element by element: no call of LAPACK.
+    """The Cholesky factor L of a symmetric matrix M, N x N, element by element, without LAPACK.
 
-    What it returns is NaN where M is not positive definite.
+    All results are NaN if M is not positive definite.
 
     Args:
         matrix: M, ``[*B, N, N]``; its lower triangle is read.
-        ridge: is added to the diagonal.
+        ridge: number added to the diagonal.
 
     Examples:
         >>> system = WrittenOut(torch.tensor([[4.0, 0.0], [2.0, 2.0]]))
@@ -121,7 +121,7 @@ class WrittenOut:
 
     def __init__(self, matrix: Tensor, ridge: float = 0):
         lower: list[list[Tensor]] = []
-        for i in range(matrix.shape[-1]):  # each element is [*B, 1], NaN from a pivot on that has no root
+        for i in range(matrix.shape[-1]):  # each element is [*B, 1], NaN after a pivot that is not positive
             row: list[Tensor] = []
             for j in range(i + 1):
                 rest = matrix[..., i, j, None]
@@ -136,7 +136,7 @@ class WrittenOut:
         self.lower = lower
 
     def factor(self) -> Tensor:
-        """Returns L, ``[*B, N, N]``, all NaN where there is none."""
+        """Returns L, ``[*B, N, N]``, all NaN if M is not positive definite."""
         last = self.lower[-1][-1]  # NaN where any pivot is not positive
         zero = torch.where(last > 0, torch.zeros_like(last), last)
         rows = [torch.cat([*row, *[zero] * (len(self.lower) - len(row))], -1) for row in self.lower]
@@ -172,7 +172,7 @@ class WrittenOut:
 
     def _solve(self, right: Tensor) -> list[Tensor]:
         solved = self._forward(right)
-        for i in reversed(range(len(solved))):  # with the transpose of L, in place
+        for i in reversed(range(len(solved))):  # with the transpose of L
             for k in range(i + 1, len(solved)):
                 solved[i] = solved[i] - self.lower[k][i] * solved[k]
             solved[i] = solved[i] / self.lower[i][i]

@@ -1,14 +1,14 @@
-r"""Spaces that states and readings live in: numbers, angles, rotations, motions, and products of them.
+r"""Spaces of states and readings: numbers, angles, rotations, motions, and products of them.
 
-A *point* is how a state is stored. A *tangent* is a small step from a point, in as many numbers as the space has
-directions; errors and covariances are in them. One convention holds everywhere but in :class:`Opposite`:
+A *point* is the stored form of a state. A *tangent* is a small step from a point, with one component per degree of
+freedom; errors and covariances are tangents. One convention holds everywhere but in :class:`Opposite`:
 
 .. math:: x \oplus d = x \, \exp(d), \qquad x \ominus y = \log(y^{-1} x),
 
-a step is applied on the right, in the axes of the point it starts from. So :math:`y \oplus (x \ominus y) = x`.
+a step is applied on the right, in the axes of its start. So :math:`y \oplus (x \ominus y) = x`.
 
 A rotation is a unit quaternion with w first, as MuJoCo stores it; it takes the body's axes to the world's. A quaternion
-and its negative are the same rotation. Orientation stands first in points and in tangents.
+and its negative are the same rotation. Orientation comes first in points and in tangents.
 
 Source: Solà, Deray & Atchuthan 2018, arXiv:1812.01537 (all but SE23); Barrau & Bonnabel 2017, IEEE T-AC 62 (SE23);
 Barfoot 2017, State Estimation for Robotics, eq. 7.86 (the Jacobian's lower block).

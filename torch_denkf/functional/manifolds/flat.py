@@ -15,22 +15,22 @@ from torch_denkf.functional.manifolds.space import Space, eye
 __all__ = ["Circle", "Euclidean", "Flat"]
 
 _Parts = Callable[..., tuple[Tensor, ...]]
-_RUNS = 4  # of angles and of other numbers, up to which cutting them apart costs less than a mask
+_RUNS = 4  # largest number of runs of angles and of other components for which splitting is faster than a mask
 
 
 class Flat(Space):
-    """N plain numbers, of which some are angles in rad, in any order: lines and circles.
+    """N plain numbers, some of which may be angles in rad, in any order: lines and circles.
 
-    Points and tangents are both N numbers. All is in closed form: a difference and a sum are those of the numbers,
+    Points and tangents both have N components. All formulas are closed: differences and sums are component-wise,
     with angles wrapped to [-pi, pi), and Jacobians are the identity.
 
     Args:
         size: N.
-        circular: components that are angles.
+        circular: indices of the angles.
 
     Raises:
-        TypeError: if a component is no whole number.
-        ValueError: if there is no such component.
+        TypeError: if an index is no whole number.
+        ValueError: if an index is out of range.
 
     Example:
         >>> plane = Flat(3, circular=[2])  # x, y and a heading: Euclidean(2) * Circle()
@@ -47,7 +47,7 @@ class Flat(Space):
             check_number("circular", component, least=0, below=size)
         turns = [index in self.circular for index in range(size)]  # no groupby, which torch.compile cannot trace
         ends = [index for index in range(1, size + 1) if index == size or turns[index] != turns[index - 1]]
-        runs = zip((0, *ends[:-1]), ends, strict=True)  # side by side: whether angles, how many
+        runs = zip((0, *ends[:-1]), ends, strict=True)  # consecutive: whether angles, and their number
         self._runs = tuple((turns[begin], end - begin) for begin, end in runs)
 
     def __repr__(self):
@@ -66,7 +66,7 @@ class Flat(Space):
 
     @property
     def parts(self) -> tuple[Space, ...]:  # type: ignore[override]
-        """Returns the lines that stand side by side, and each circle."""
+        """Returns the lines, adjacent ones together, and each circle."""
         return tuple(
             part for turns, count in self._runs for part in ([Circle()] * count if turns else [Euclidean(count)])
         )
@@ -90,7 +90,7 @@ class Flat(Space):
         return torch.zeros(self.size) if like is None else like.new_zeros(self.size)
 
     def normalise(self, point):
-        """Wraps the angles among the numbers."""
+        """Wraps the angles."""
         return self._apart(lambda angle: (wrap_angles(angle),), _same, point)[0]
 
     exp = log = normalise
@@ -106,7 +106,7 @@ class Flat(Space):
         return self.normalise(point - origin)
 
     def mean(self, points, weights=None):
-        """Returns the mean; of angles that of the deviations from the direction of their sum as unit vectors."""
+        """Returns the mean; for angles the circular direction plus the mean of the deviations from it."""
 
         def of_circles(values: Tensor) -> tuple[Tensor]:
             center = _direction(values, weights)
@@ -117,14 +117,14 @@ class Flat(Space):
     near = mean
 
     def innovation(self, reading, expected, observed=None):
-        """Returns the difference, angles wrapped; NaN where the reading is."""
+        """Returns the difference, angles wrapped; NaN if the reading is NaN."""
         return self.minus(reading, expected)
 
     def align(self, predicted, reading, observed=None):
-        """Brings angles to the same turn; plain numbers stay as they are.
+        """Moves angles to the same turn; plain numbers are unchanged.
 
-        Predictions go within half a turn of their circular mean, the reading's samples within half a turn of their own,
-        and that within half a turn of the predictions'. See :meth:`Space.align`.
+        Predictions are moved to within half a turn of their circular mean, the reading's samples to within half a turn
+        of their own, and their mean to within half a turn of the predictions'. See :meth:`Space.align`.
 
         Example:
             >>> predicted, reading = Circle().align(torch.tensor([[3.1], [-3.1]]), torch.tensor([-3.0]))
@@ -147,7 +147,7 @@ class Flat(Space):
         return predicted, samples if reading.ndim == predicted.ndim else samples.squeeze(-2)
 
     def _apart(self, of_circles: _Parts, of_lines: _Parts, *values: Tensor) -> tuple[Tensor, ...]:
-        """Maps the angles among values ``[*, N]`` by one function, and the other numbers by another."""
+        """Applies one function to the angles of values ``[*, N]``, and another to the other components."""
         if not self.circular:
             return of_lines(*values)
         if len(self.circular) == self.size:
@@ -162,7 +162,7 @@ class Flat(Space):
         return tuple(torch.cat(own, -1) for own in zip(*parts, strict=True))
 
     def told(self, observed):
-        """Returns the mask itself: numbers are masked one by one."""
+        """Returns the mask itself: components are masked one by one."""
         return observed, observed
 
     _whole = told
@@ -211,6 +211,6 @@ def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def _direction(turns: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Returns the direction of the sum of unit vectors, ``[*B, 1, N]``; detached, since it only picks the turn."""
+    """Returns the direction of the sum of unit vectors, ``[*B, 1, N]``; detached, as it only selects the turn."""
     turns = turns.detach()
     return torch.atan2(_mean(turns.sin(), weights), _mean(turns.cos(), weights))

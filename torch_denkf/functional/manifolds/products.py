@@ -1,4 +1,4 @@
-"""Spaces made of others: side by side, many times, and with steps on the other side."""
+"""Spaces made of others: products, repetitions, and spaces with steps applied on the left."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ __all__ = ["Opposite", "Place", "Product", "Repeated", "places_of", "whole_parts
 class Opposite(Space):
     r"""A space whose steps are applied on the left: :math:`x \oplus d = \exp(d) \, x`, in the world's axes.
 
-    An extended Kalman filter on it is a right-invariant one. It is the same group with its products the other way
-    round.
+    An extended Kalman filter on it is a right-invariant one. It is the same group with products in reverse order.
 
     Args:
         part: the space.
@@ -49,7 +48,7 @@ class Opposite(Space):
 
     @property
     def parts(self) -> Sequence[Space]:  # type: ignore[override]
-        """Returns the parts of the space, each with its steps on the other side."""
+        """Returns the parts of the space, each with steps on the left."""
         return tuple(part.flat or Opposite(part) for part in self.part.parts)
 
     @property
@@ -58,55 +57,55 @@ class Opposite(Space):
 
     def compose(self, first, second):
         """Composes in reverse order: the second, then the first."""
-        return self.part.compose(self.part.normalise(second), first)  # a reading may be so to rounding alone
+        return self.part.compose(self.part.normalise(second), first)  # a reading may be a point only up to rounding
 
     def inverse(self, point):
-        """Returns that of the space."""
+        """Returns the inverse in the space."""
         return self.part.inverse(point)
 
     def exp(self, tangent):
-        """Returns that of the space."""
+        """Returns the exponential in the space."""
         return self.part.exp(tangent)
 
     def log(self, point):
-        """Returns that of the space."""
+        """Returns the logarithm in the space."""
         return self.part.log(point)
 
     def right_jacobian(self, tangent):
-        """Returns the left one of the space."""
+        """Returns the left Jacobian of the space."""
         return self.part.right_jacobian(-tangent)
 
     def adjoint(self, point):
-        """Returns the inverse of the space's: it takes errors in the world's axes to the body's."""
+        """Returns the inverse adjoint of the space, which takes errors from the world's axes to the body's."""
         return self.part.adjoint(self.part.inverse(point))
 
     def basis(self, point):
-        """Returns that of the space, of the step as the body sees it."""
+        """Returns the basis of the space, for a step in the world's axes."""
         return self.part.basis(point) @ self.adjoint(point)
 
     def dual_basis(self, point):
-        """Returns that of the space, as the world sees it."""
+        """Returns the dual basis of the space, with the step in the world's axes."""
         return self.part.adjoint(point) @ self.part.dual_basis(point)
 
     def neutral(self, like=None):
-        """Returns that of the space."""
+        """Returns the neutral point of the space."""
         return self.part.neutral(like)
 
     def normalise(self, point):
-        """Returns that of the space."""
+        """Normalises a point of the space."""
         return self.part.normalise(point)
 
     def near(self, points, weights=None):
-        """Returns that of the space."""
+        """Returns a point near the mean in the space."""
         return self.part.near(points, weights)
 
 
 class _Made(Space):
-    """A space that is made of others: what each of them does, side by side."""
+    """Base of spaces made of others, whose methods work on each part."""
 
     @property
     def flat(self):
-        """Returns the joined lines and circles."""
+        """Returns the parts joined to one flat space; ``None`` if a part is not flat."""
         circular, size = [], 0
         for part in self.parts:
             if part.flat is None:
@@ -124,11 +123,11 @@ class _Made(Space):
         return self._each("inverse", point)
 
     def exp(self, tangent):
-        """Returns the point of each part's tangent."""
+        """Maps the tangent of each part to a point."""
         return self._each("exp", tangent)
 
     def log(self, point):
-        """Returns the tangent of each part."""
+        """Maps the point of each part to a tangent."""
         return self._each("log", point)
 
     def normalise(self, point):
@@ -136,33 +135,33 @@ class _Made(Space):
         return self._each("normalise", point)
 
     def right_jacobian(self, tangent):
-        """Returns those of the parts, as blocks."""
+        """Returns the block-diagonal matrix of the parts' Jacobians."""
         return self._diagonal("right_jacobian", tangent)
 
     def adjoint(self, point):
-        """Returns those of the parts, as blocks."""
+        """Returns the block-diagonal matrix of the parts' adjoints."""
         return self._diagonal("adjoint", point)
 
     def basis(self, point):
-        """Returns those of the parts, as blocks."""
+        """Returns the block-diagonal matrix of the parts' bases."""
         return self._diagonal("basis", point)
 
     def dual_basis(self, point):
-        """Returns those of the parts, as blocks."""
+        """Returns the block-diagonal matrix of the parts' dual bases."""
         return self._diagonal("dual_basis", point)
 
     def _each(self, name: str, *values: Tensor) -> Tensor:
-        """Returns what a method of each part makes of its own numbers, side by side."""
+        """Applies a method of each part to the part's components, and concatenates the results."""
         raise NotImplementedError
 
     def _diagonal(self, name: str, value: Tensor) -> Tensor:
-        """Returns what a method of each part makes of its own numbers, as blocks of a diagonal."""
+        """Applies a method of each part to the part's components, and returns block-diagonal matrices."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Product(_Made):
-    """Several spaces side by side: points and tangents are those of the parts, one behind the other.
+    """Product of several spaces: points and tangents are those of the parts, concatenated.
 
     Args:
         *parts: spaces.
@@ -186,13 +185,13 @@ class Product(_Made):
         object.__setattr__(self, "tangent_dim", sum(part.tangent_dim for part in parts))
 
     def exp_and_jacobian(self, tangent):
-        """Returns those of the parts, side by side and as blocks."""
+        """Returns the points of the parts, concatenated, and their Jacobians, block-diagonal."""
         pairs = [part.exp_and_jacobian(own) for part, own in zip(self.parts, self._apart("exp", tangent), strict=True)]
         points, jacobians = zip(*pairs, strict=True)
         return torch.cat(points, -1), blocks(jacobians)
 
     def neutral(self, like=None):
-        """Returns those of the parts."""
+        """Returns the neutral points of the parts, concatenated."""
         return torch.cat([part.neutral(like) for part in self.parts])
 
     def mean(self, points, weights=None):
@@ -200,11 +199,11 @@ class Product(_Made):
         return self._each("mean", points, weights=weights)
 
     def near(self, points, weights=None):
-        """Returns a point near those of each part."""
+        """Returns a point near the mean of each part."""
         return self._each("near", points, weights=weights)
 
     def points(self, point: Tensor) -> Sequence[Tensor]:
-        """Returns the numbers of each part."""
+        """Returns the components of each part."""
         return point.split_with_sizes([part.point_dim for part in self.parts], -1)
 
     def _apart(self, name: str, value: Tensor) -> Sequence[Tensor]:
@@ -223,7 +222,7 @@ class Product(_Made):
 
 @dataclass(frozen=True)
 class Repeated(_Made):
-    """N points of one space side by side: ``Product(space, space, ...)``, worked out for all at once.
+    """N points of one space: ``Product(space, space, ...)``, computed for all at once.
 
     Args:
         part: the space.
@@ -250,15 +249,15 @@ class Repeated(_Made):
 
     @property
     def parts(self) -> Sequence[Space]:  # type: ignore[override]
-        """Returns N times the same."""
+        """Returns the space N times."""
         return (self.part,) * self.count
 
     def neutral(self, like=None):
-        """Returns N times the same."""
+        """Returns its neutral point N times."""
         return self.part.neutral(like).repeat(self.count)
 
     def near(self, points, weights=None):
-        """Works point by point."""
+        """Returns a point near the mean for each of the N points."""
         apart = points.unflatten(-1, (self.count, -1)).movedim(-2, -3)
         return self.part.near(apart, None if weights is None else weights.unsqueeze(-2)).flatten(-2)
 
@@ -271,13 +270,13 @@ class Repeated(_Made):
 
 
 class Place(NamedTuple):
-    """A part of a product, and where it stands.
+    """A part of a product, and its position.
 
     Attributes:
         space: the part.
-        point: its numbers among those of a point.
-        tangent: its numbers among those of a tangent.
-        rotation: those of the tangent that are a rotation, an angle or an axis times an angle; they may be none.
+        point: its components of a point.
+        tangent: its components of a tangent.
+        rotation: the tangent components that are a rotation, an angle or an axis times an angle; possibly none.
     """
 
     space: Space
@@ -287,7 +286,7 @@ class Place(NamedTuple):
 
 
 def places_of(space: Space) -> list[Place]:
-    """Returns the parts of a product, and of products within it; a space that is none is its own part.
+    """Returns the parts of a product, and of products within it; another space is its own only part.
 
     Example:
         >>> from torch_denkf.functional.manifolds import Euclidean, SE3
@@ -309,14 +308,14 @@ def places_of(space: Space) -> list[Place]:
 
 
 def whole_parts(space: Space, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Marks the parts of which all is known: a rotation of which one number is missing is not, nor is its pose.
+    """Marks the parts that are known completely: one unknown component makes a rotation, and its pose, unknown.
 
     Args:
-        space: S.
-        known: which numbers of points are known, ``[*, P]`` bool. Plain numbers are known one by one.
+        space: the space.
+        known: known components of points, ``[*, P]`` bool. Plain numbers are known one by one.
 
     Returns:
-        The numbers of points that stand in whole parts, ``[*, P]``, and the tangents' numbers that can be told,
+        Components of points in completely known parts, ``[*, P]``, and the known components of tangents,
         ``[*, D]``.
 
     Example:

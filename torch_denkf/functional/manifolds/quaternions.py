@@ -11,10 +11,10 @@ __all__ = ["quaternion_of", "quaternion_product", "rotate", "rotation_matrix", "
 
 
 class Table:
-    """Picks numbers ``[*, M]`` of ``[*, N]``, times signs: a matrix of a few numbers in two calls.
+    """Selects components ``[*, M]`` from ``[*, N]`` and multiplies by signs: builds a small matrix in two calls.
 
     Args:
-        places: of the numbers among the N, M digits.
+        places: indices of the components among the N, M digits.
         signs: M of ``+``, ``-`` and ``0``.
     """
 
@@ -22,8 +22,8 @@ class Table:
         self.places, self.signs = list(map(int, places)), [{"+": 1.0, "-": -1.0, "0": 0.0}[sign] for sign in signs]
 
     def __call__(self, numbers: Tensor) -> Tensor:
-        """Returns the numbers."""
-        if torch.compiler.is_compiling():  # inductor (torch 2.13) makes other numbers of the indices
+        """Returns the selected components times their signs."""
+        if torch.compiler.is_compiling():  # inductor (torch 2.13) changes the indices
             return torch.stack([sign * numbers[..., at] for at, sign in zip(self.places, self.signs, strict=True)], -1)
         dtype, device = numbers.dtype, numbers.device
         places = made_once((self, device), lambda: torch.as_tensor(self.places, device=device))
@@ -31,14 +31,14 @@ class Table:
         return numbers.index_select(-1, places) * signs
 
 
-#: The matrix of products with a quaternion; its conjugate; its products with i, j and k; and that of cross products.
+#: Tables for the matrix of quaternion products, the conjugate, products with i, j and k, and cross products.
 _TIMES = Table("0123103223013210", "+---++-++++-+-++")
 _BACK = Table("0123", "+---")
 _TURNS = Table("123032301210", "---+-+++--++")
 _CROSS = Table("021200100", "0-++0--+0")
-#: Two products each, of which a rotation matrix is twice the sum, and the identity.
+#: Tables of two factors: a rotation matrix is the identity plus twice the sum of two products each.
 _FIRST, _SECOND = Table("231010101320102012", "--+-++++--+-+-++--"), Table("232332231331323112", "+" * 18)
-#: The right Jacobian of a rotation but for its third term, of a quaternion times 2 sin(a/2) / a.
+#: Table of a rotation's right Jacobian without its third term, to apply to a quaternion times 2 sin(a/2) / a.
 BENT = Table("032301210", "++--+++-+")
 
 
@@ -48,14 +48,14 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
 
 
 def rotate(quaternion: Tensor, vector: Tensor, *, back: bool = False) -> Tensor:
-    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``; or ``back``."""
+    """Rotates a vector ``[*, 3]`` from the body's axes to the world's by a quaternion ``[*, 4]``, or ``back``."""
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     twice = 2 * _cross(axis, vector)
     return torch.addcmul(vector, w, twice, value=-1 if back else 1) + _cross(axis, twice)
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
-    if second.ndim == 1:  # torch pads no dimensions
+    if second.ndim == 1:  # torch.linalg.cross adds no dimensions
         second = second.expand_as(first)
     elif first.ndim != second.ndim:
         first, second = torch.broadcast_tensors(first, second)
@@ -69,7 +69,7 @@ def rotation_matrix(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_of(matrix: Tensor) -> Tensor:
-    """Returns a quaternion ``[*, 4]`` of a rotation matrix ``[*, 3, 3]``, by the largest of its four numbers."""
+    """Returns a quaternion ``[*, 4]`` of a rotation matrix ``[*, 3, 3]``, by the largest of its four components."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
     candidates = [
         torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),

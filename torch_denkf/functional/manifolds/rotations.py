@@ -1,4 +1,4 @@
-"""Rotations in the plane and in space, and vectors that they turn."""
+"""Rotations in the plane and in space, alone and with vectors that they rotate."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from torch_denkf.functional.manifolds.space import Space, blocks, eye, side_by_s
 
 __all__ = ["SE2", "SE3", "SE23", "SO3", "Turned"]
 
-_SMALL = {torch.float32: 0.25, torch.float64: 1e-2}  # angles squared below which a series is as exact as the formula
-_NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # tangents squared below which the arc tangent's series is as exact
+_SMALL = {torch.float32: 0.25, torch.float64: 1e-2}  # squared angles below which a series is as exact as the formula
+_NEAR = {torch.float32: 1e-2, torch.float64: 1e-4}  # squared sines below which the arc tangent's series is as exact
 
 
 def _one_by_one(self: Space, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Narrows a mask of tangents to a whole rotation and whole vectors, which are told apart."""
+    """Narrows a mask of tangents: the rotation, and each vector, counts as observed only as a whole."""
     turn, size = known[..., : self._angles].all(-1, keepdim=True), 2 if self._angles == 1 else 3
     vectors = known[..., self._angles :].unflatten(-1, ((self.tangent_dim - self._angles) // size, size))
     vectors = vectors.all(-1).repeat_interleave(size, -1)
@@ -43,7 +43,7 @@ class SE2(Space):
 
     Example:
         >>> turned = torch.tensor([torch.pi / 2, 0.0, 0.0])
-        >>> SE2().plus(turned, torch.tensor([0.0, 1.0, 0.0])).round(decimals=4) + 0.0  # ahead is along y now
+        >>> SE2().plus(turned, torch.tensor([0.0, 1.0, 0.0])).round(decimals=4) + 0.0  # forward is along y
         tensor([1.5708, 0.0000, 1.0000])
     """
 
@@ -52,7 +52,7 @@ class SE2(Space):
     _told = _one_by_one
 
     def compose(self, first, second):
-        """Composes two poses: the second one is seen from the first one's axes."""
+        """Composes two poses: the second one is given in the first one's axes."""
         return torch.cat(
             [wrap_angles(first[..., :1] + second[..., :1]), _turn(first, second[..., 1:]) + first[..., 1:]], -1
         )
@@ -63,13 +63,13 @@ class SE2(Space):
         return torch.cat([back[..., :1], _turn(back, back[..., 1:])], -1)
 
     def exp(self, tangent):
-        """Maps a constant twist to the pose that it leads to, along an arc."""
+        """Maps a constant twist to the pose at the end of its arc."""
         along, across = self._arc(tangent[..., :1])
         x, y = tangent[..., 1:2], tangent[..., 2:]
         return torch.cat([wrap_angles(tangent[..., :1]), along * x - across * y, across * x + along * y], -1)
 
     def log(self, point):
-        """Returns the twist that leads to a point."""
+        """Returns the constant twist from the neutral pose to a point."""
         angle = wrap_angles(point[..., :1])
         along, across = self._arc(angle)
         size = along.square() + across.square()
@@ -95,7 +95,7 @@ class SE2(Space):
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def basis(self, point):
-        """Rotates the directions ahead and to the left."""
+        """Returns the rotation of the forward and left directions."""
         cos, sin = point[..., 0].cos(), point[..., 0].sin()
         zero, one = torch.zeros_like(cos), torch.ones_like(cos)
         rows = [[one, zero, zero], [zero, cos, -sin], [zero, sin, cos]]
@@ -125,7 +125,7 @@ class SE2(Space):
 
 
 class _RotationAndVectors(Space):
-    """A rotation and K vectors that it turns; the point is (quaternion, vectors), the tangent (rotation, vectors)."""
+    """A rotation and K rotated vectors; the point is (quaternion, vectors), the tangent (rotation, vectors)."""
 
     vectors: int
     _angles = 3
@@ -142,7 +142,7 @@ class _RotationAndVectors(Space):
         return 3 + 3 * self.vectors
 
     def compose(self, first, second):
-        """Composes two points: the second one is seen from the first one's axes."""
+        """Composes two points: the second one is given in the first one's axes."""
         turn = unit(quaternion_product(first, second[..., :4]))
         if not self.vectors:
             return turn
@@ -157,7 +157,7 @@ class _RotationAndVectors(Space):
         return torch.cat([back, -rotate(back.unsqueeze(-2), self._vectors(point, 4)).flatten(-2)], -1)
 
     def exp(self, tangent):
-        """Maps a tangent, a constant rate of all, to the point that it leads to."""
+        """Maps a tangent, taken as constant rates, to the point that it leads to."""
         angles = tangent[..., :3]
         square = angles.square().sum(-1, keepdim=True)
         w, share, *bends = several(square, *_EXP[: 4 if self.vectors else 2])
@@ -165,7 +165,7 @@ class _RotationAndVectors(Space):
         return self._bent(quaternion, angles, tangent, *bends) if self.vectors else quaternion
 
     def log(self, point):
-        """Returns the shorter rotation, and what leads to the vectors meanwhile."""
+        """Returns the shorter rotation, and the constant rates of the vectors that lead to the point."""
         quaternion = point[..., :4]
         quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
         w, axis = quaternion[..., :1], quaternion[..., 1:]
@@ -179,7 +179,7 @@ class _RotationAndVectors(Space):
         return self._bent(turns, turns, point, torch.full_like(third, -0.5), third)
 
     def _bent(self, turn: Tensor, turns: Tensor, value: Tensor, half: Tensor, third: Tensor) -> Tensor:
-        """Returns a rotation, and what :func:`bend` makes of the vectors of a point or tangent."""
+        """Returns a rotation together with the :func:`bend` of the vectors of a point or tangent."""
         if not self.vectors:
             return turn
         vectors = self._vectors(value, value.shape[-1] - 3 * self.vectors)
@@ -187,7 +187,7 @@ class _RotationAndVectors(Space):
         return torch.cat([turn, bent.flatten(-2)], -1)
 
     def right_jacobian(self, tangent):
-        """Returns the matrix of Solà et al., eq. 143; Barfoot, eq. 7.86, of the negative tangent."""
+        """Returns the matrix of Solà et al., eq. 143; Barfoot, eq. 7.86, for the negative tangent."""
         angles, functions = tangent[..., :3], (half_versine, one_minus_sinc, fourth, fifth)
         found = several(angles.square().sum(-1, keepdim=True), *functions[: 4 if self.vectors else 2])
         half, third, *lower = (value.unsqueeze(-1) for value in found)
@@ -196,7 +196,7 @@ class _RotationAndVectors(Space):
         block = torch.addcmul(torch.addcmul(unit, half, turn, value=-1), third, turn2)
         if not self.vectors:
             return block
-        # With vectors v, products of w x and v x are w v^T and the like.
+        # Products of the skew matrices of w and v are written with w v^T.
         (fall, low), vectors = lower, self._vectors(tangent, 3)
         turns = angles.unsqueeze(-2).expand_as(vectors)
         again = torch.linalg.cross(turns, torch.linalg.cross(turns, vectors))
@@ -206,13 +206,13 @@ class _RotationAndVectors(Space):
         return self._matrix(block, torch.addcmul(low, along, shared.unsqueeze(-3)))
 
     def exp_and_jacobian(self, tangent):
-        """Returns point and Jacobian; for a rotation alone from three functions of its angle."""
+        """Returns point and Jacobian; without vectors they are computed from three functions of the angle."""
         if self.vectors:
             return super().exp_and_jacobian(tangent)
         square = tangent.square().sum(-1, keepdim=True)
         w, share, third = several(square, cos_half, half_sinc_half, one_minus_sinc, formula=_of_half)
         turn = torch.cat([w, share * tangent], -1)
-        bent = torch.unflatten(BENT(2 * share * turn), -1, (3, 3))  # sin a and 1 - cos a of a / 2
+        bent = torch.unflatten(BENT(2 * share * turn), -1, (3, 3))  # sin a and 1 - cos a from a / 2
         return turn, torch.addcmul(bent, (third * tangent).unsqueeze(-1), tangent.unsqueeze(-2))
 
     def adjoint(self, point):
@@ -221,22 +221,22 @@ class _RotationAndVectors(Space):
         return self._matrix(turn, skew(self._vectors(point, 4)) @ turn.unsqueeze(-3)) if self.vectors else turn
 
     def _matrix(self, block: Tensor, low: Tensor) -> Tensor:
-        """Assembles a matrix of blocks ``[*, 3, 3]`` on the diagonal, and others ``[*, K, 3, 3]`` below the first."""
+        """Assembles a matrix with blocks ``[*, 3, 3]`` on the diagonal, and ``[*, K, 3, 3]`` below the first."""
         first = torch.cat([block, low.flatten(-3, -2)], -2)
         others = eye(block[..., 0], self.vectors)[..., None, :, None] * block[..., None, :, None, :]
         others = others.flatten(-2).flatten(-3, -2)
         return torch.cat([first, torch.cat([torch.zeros_like(others[..., :3, :]), others], -2)], -1)
 
     def basis(self, point):
-        """Returns half the quaternion's products with i, j and k; the rotation, once for each vector."""
+        """Returns block-diagonal half products of the quaternion with i, j and k, and the rotation for each vector."""
         return blocks([products(point) / 2, *[rotation_matrix(point[..., :4])] * self.vectors])
 
     def dual_basis(self, point):
-        """Returns the transpose of :meth:`basis`, with twice the products."""
+        """Returns the transpose of :meth:`basis`, with twice the products instead of half."""
         return blocks([2 * products(point), *[rotation_matrix(point[..., :4])] * self.vectors]).mT
 
     def neutral(self, like=None):
-        """Returns no rotation and zeros."""
+        """Returns the identity rotation and zero vectors."""
         zeros = torch.zeros(self.point_dim) if like is None else like.new_zeros(self.point_dim)
         return torch.cat([torch.ones_like(zeros[:1]), zeros[1:]])
 
@@ -280,7 +280,7 @@ class SE3(_RotationAndVectors):
 
 @dataclass(frozen=True)
 class SE23(_RotationAndVectors):
-    """Orientation, velocity and position: the point is (quaternion, velocity, position), the tangent has nine numbers.
+    """Orientation, velocity and position: the point is (quaternion, velocity, position), the tangent has 9 components.
 
     Example:
         >>> SE23().point_dim, SE23().tangent_dim
@@ -292,7 +292,7 @@ class SE23(_RotationAndVectors):
 
 @dataclass(frozen=True)
 class Turned(_RotationAndVectors):
-    """A rotation and K vectors that it turns, such as velocity, position and landmarks: SE_K(3).
+    """A rotation and K vectors that it rotates, such as velocity, position and landmarks: SE_K(3).
 
     Args:
         vectors: K.
@@ -314,14 +314,14 @@ def _turn(pose: Tensor, vector: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Function:
-    """An even function of an angle: by its formula, and by the first terms of its series in the angle squared."""
+    """An even function of an angle: its formula, and the first terms of its series in the squared angle."""
 
     formula: Callable[[Tensor], Tensor]
     terms: tuple[float, ...]
 
 
 def series(square: Tensor, function: Function) -> Tensor:
-    """Returns the value at the angle whose square is given; value and gradient are finite at 0."""
+    """Evaluates a function of an angle, given the square of the angle; value and gradient are finite at 0."""
     small = square < _SMALL[square.dtype]
     safe = torch.where(small, 1.0, square).sqrt()
     near = torch.zeros_like(square)
@@ -334,9 +334,9 @@ def several(square: Tensor, *functions: Function, formula: Callable | None = Non
     """Returns the :func:`series` of several functions of squares ``[*, 1]``, in fewer calls.
 
     Args:
-        square: angles squared.
-        functions: what is wanted.
-        formula: of all, where they share what they need.
+        square: squared angles.
+        functions: the functions.
+        formula: computes all functions together, if they share terms.
     """
     if torch.compiler.is_compiling():
         return [series(square, function) for function in functions]
@@ -353,7 +353,7 @@ def several(square: Tensor, *functions: Function, formula: Callable | None = Non
 
 
 def _of_half(angle: Tensor) -> Sequence[Tensor]:
-    """Returns the formulas of the exponential's three functions from those of half the angle."""
+    """Returns the three functions of the exponential from sine and cosine of half the angle."""
     half = 0.5 * angle
     w, share = half.cos(), half.sin() / angle
     return w, share, torch.rsub(w * share, 1, alpha=2) / angle.square()
@@ -372,7 +372,7 @@ inverse_third = Function(
     lambda a: (1 - a / 2 * (a / 2).cos() / (a / 2).sin()) / a**2, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600)
 )
 
-#: What the exponential of a rotation needs, and behind it that of the vectors which it turns.
+#: The functions in the exponential of a rotation, followed by those for the vectors.
 _EXP = (cos_half, half_sinc_half, half_versine, one_minus_sinc)
 
 

@@ -1,4 +1,4 @@
-"""The base of all spaces."""
+"""Base class of all spaces."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ if TYPE_CHECKING:
 
 __all__ = ["Space", "check_space", "is_flat"]
 
-_MEAN_STEPS = 3  # of Gauss-Newton, each of which takes at least the square of the spread off the error
+_MEAN_STEPS = 3  # Gauss-Newton steps; each multiplies the error by about the square of the spread
 
 
 class Space:
-    """A space of points; the base of all.
+    """A space of points; the base class of all spaces.
 
-    All spaces here are Lie groups. A subclass writes :meth:`compose`, :meth:`inverse`, :meth:`exp`, :meth:`log`,
-    :meth:`right_jacobian`, :meth:`adjoint`, :meth:`basis`, :meth:`dual_basis` and :meth:`neutral`. Two spaces of one
+    All spaces here are Lie groups. A subclass implements :meth:`compose`, :meth:`inverse`, :meth:`exp`, :meth:`log`,
+    :meth:`right_jacobian`, :meth:`adjoint`, :meth:`basis`, :meth:`dual_basis` and :meth:`neutral`. Spaces of one
     kind are equal.
 
     Attributes:
-        point_dim: numbers of a point, P.
-        tangent_dim: numbers of a tangent, D.
+        point_dim: number of components of a point, P.
+        tangent_dim: number of components of a tangent, D.
     """
 
     point_dim: int
     tangent_dim: int
-    parts: Sequence[Space] = ()  # of which it is made, if it is made of others
-    _angles = 0  # leading numbers of a tangent that are a rotation
+    parts: Sequence[Space] = ()  # the spaces of a product
+    _angles = 0  # leading components of a tangent that are a rotation
 
     @property
     def flat(self) -> Flat | None:
-        """Returns the space as lines and circles in closed form; ``None`` for a space that holds anything else."""
+        """Returns the space as lines and circles in closed form; ``None`` if it has other parts."""
         return None
 
     def __mul__(self, other: Space) -> Product:
-        """Returns the product of both, with the points of ``other`` behind."""
+        """Returns the product of both spaces; the components of ``other`` come last."""
         from torch_denkf.functional.manifolds.products import Product
 
         if not isinstance(other, Space):
@@ -49,19 +49,19 @@ class Space:
         return Product(*(part for one in (self, other) for part in (one.parts if isinstance(one, Product) else [one])))
 
     def compose(self, first: Tensor, second: Tensor) -> Tensor:
-        """Returns the product of two points ``[*, P]``."""
+        """Returns the group product of two points ``[*, P]``."""
         raise NotImplementedError
 
     def inverse(self, point: Tensor) -> Tensor:
-        """Returns the inverse of a point ``[*, P]``, which takes it back to the neutral one."""
+        """Returns the inverse of a point ``[*, P]``; their product is the neutral point."""
         raise NotImplementedError
 
     def exp(self, tangent: Tensor) -> Tensor:
-        """Maps a tangent ``[*, D]`` at the neutral point to the point that it leads to, ``[*, P]``."""
+        """Maps a tangent ``[*, D]`` at the neutral point to a point ``[*, P]``."""
         raise NotImplementedError
 
     def log(self, point: Tensor) -> Tensor:
-        """Returns the shortest tangent ``[*, D]`` that leads from the neutral point to a point ``[*, P]``."""
+        """Returns the shortest tangent ``[*, D]`` from the neutral point to a point ``[*, P]``."""
         raise NotImplementedError
 
     def right_jacobian(self, tangent: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class Space:
         raise NotImplementedError
 
     def exp_and_jacobian(self, tangent: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share what they need."""
+        """Returns :meth:`exp` and :meth:`right_jacobian`, which may share computations."""
         return self.exp(tangent), self.right_jacobian(tangent)
 
     def adjoint(self, point: Tensor) -> Tensor:
@@ -89,11 +89,11 @@ class Space:
         raise NotImplementedError
 
     def normalise(self, point: Tensor) -> Tensor:
-        """Returns the nearest point to numbers ``[*, P]`` that are one but for rounding, or that a network gave."""
+        """Returns the nearest point to values ``[*, P]`` with rounding errors, or from a network."""
         return point
 
     def plus(self, point: Tensor, tangent: Tensor) -> Tensor:
-        """Returns the point ``[*, P]`` that a tangent ``[*, D]`` leads to."""
+        """Returns the point ``[*, P]`` at the end of a tangent ``[*, D]`` from ``point``."""
         self.check(point=point, tangent=tangent)
         return self.compose(point, self.exp(tangent))
 
@@ -107,9 +107,9 @@ class Space:
         return torch.linalg.vector_norm(self.minus(point, other), dim=-1)
 
     def mean(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Returns the point ``[*B, P]`` around which the tangents to points ``[*B, E, P]`` add up to zero.
+        """Returns the point ``[*B, P]`` at which the tangents to points ``[*B, E, P]`` add up to zero.
 
-        A few Gauss-Newton steps. It is unique where the points lie within a quarter turn of one of them.
+        It takes a few Gauss-Newton steps. The mean is unique if all points are within a quarter turn of one of them.
 
         Args:
             points: ``[*B, E, P]``.
@@ -123,20 +123,20 @@ class Space:
         return center.squeeze(-2)
 
     def near(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Returns a point ``[*B, P]`` near the mean, where any will do for tangents: the mean of the numbers."""
+        """Returns a point ``[*B, P]`` near the mean, to which tangents can be taken: the mean of the components."""
         return self.normalise(self._between(points, weights)).squeeze(-2)
 
     def _between(self, points: Tensor, weights: Tensor | None) -> Tensor:
-        """Returns a point ``[*B, 1, P]`` near the mean: the mean of the numbers, counted from the first point."""
+        """Returns a point ``[*B, 1, P]`` near the mean: the first point plus the mean difference from it."""
         away = points - points[..., :1, :]
         away = away.mean(-2, keepdim=True) if weights is None else (weights.unsqueeze(-1) * away).sum(-2, keepdim=True)
         return points[..., :1, :] + away
 
     def innovation(self, reading: Tensor, expected: Tensor, observed: Tensor | None = None) -> Tensor:
-        """Returns the shortest tangent ``[*, D]`` from an expected reading to the one that came, both ``[*, P]``.
+        """Returns the shortest tangent ``[*, D]`` from an expected reading to the actual one, both ``[*, P]``.
 
-        Where a mask ``[*, 1]`` or ``[*, D]`` hides the reading, see :meth:`told`, the expected one stands in its place:
-        no number there, a zero or NaN, has a part in a value or a gradient.
+        Where a mask ``[*, 1]`` or ``[*, D]`` marks the reading as missing (see :meth:`told`), the expected reading
+        replaces it, so that zeros or NaN there affect neither values nor gradients.
         """
         self.check(reading=reading, expected=expected)
         if observed is not None:
@@ -144,10 +144,10 @@ class Space:
         return self.minus(*torch.broadcast_tensors(reading, expected))
 
     def told(self, observed: Tensor) -> tuple[Tensor, Tensor]:
-        """Narrows a mask ``[*, D]`` to whole rotations and vectors: the numbers of one that is hidden in part mix.
+        """Narrows a mask ``[*, D]`` to whole rotations and vectors, since the components of one are coupled.
 
         Returns:
-            The mask of a point's numbers ``[*, P]``, and of a tangent's ``[*, D]``. One ``[*, 1]`` stays.
+            The mask of a point's components ``[*, P]``, and of a tangent's ``[*, D]``. A mask ``[*, 1]`` is unchanged.
         """
         if observed.shape[-1] == 1:
             return observed, observed
@@ -160,15 +160,15 @@ class Space:
     def align(self, predicted: Tensor, reading: Tensor, observed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Maps predictions and a reading to plain numbers, which can be averaged and subtracted.
 
-        They are tangents at a point near the predictions' mean.
+        The results are tangents at a point near the predictions' mean.
 
         Args:
-            predicted: points that the members predict, ``[*B, E, P]``.
+            predicted: predicted readings of the members, ``[*B, E, P]``.
             reading: a point ``[*B, P]``, or samples ``[*B, E, P]``.
-            observed: mask ``[*B, 1]`` or ``[*B, D]``; what it hides may be NaN.
+            observed: mask ``[*B, 1]`` or ``[*B, D]``; missing components may be NaN.
 
         Returns:
-            Numbers ``[*B, E, D]``, and ``[*B, D]`` or ``[*B, E, D]``.
+            Tangents ``[*B, E, D]``, and ``[*B, D]`` or ``[*B, E, D]``.
         """
         center = self.near(predicted)
         expected, mask = center.unsqueeze(-2), None if observed is None else observed.unsqueeze(-2)
@@ -177,24 +177,24 @@ class Space:
         return self.innovation(predicted, expected, mask), self.innovation(reading, expected, mask)
 
     def _whole(self, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns :func:`whole_parts` of a space that is no product."""
+        """Returns :func:`whole_parts` for a space that is no product."""
         known = known.all(-1, keepdim=True)
         return known.expand(*known.shape[:-1], self.point_dim), known.expand(*known.shape[:-1], self.tangent_dim)
 
-    _told = _whole  # of a mask of tangents
+    _told = _whole  # for a mask of tangents
 
     def perturb(self, point: Tensor, std: Tensor, noise: Tensor) -> Tensor:
-        """Draws a point ``[*, P]``: standard normal ``noise`` ``[*, D]`` times standard deviations ``[*, D]`` away."""
+        """Returns a random point ``[*, P]``: ``point`` plus standard normal ``noise`` ``[*, D]`` times ``std``."""
         return self.plus(point, std * noise)
 
     def check(self, **values: Tensor) -> None:
         """Raises unless the last dimension of each value has the right size, and no point is boolean.
 
         Args:
-            **values: a ``tangent``, the mask of one, ``observed``, and any points.
+            **values: tangents under the names ``tangent`` and ``observed`` (a mask), points under any other.
 
         Raises:
-            ValueError: if it has not; names the value.
+            ValueError: if a value fails; the message names it.
         """
         for name, value in values.items():
             kind = "tangent" if name in ("tangent", "observed") else "point"
@@ -205,16 +205,16 @@ class Space:
 
 
 def check_space(name: str, space: Space | None, *, flat: bool = False) -> Space | None:
-    """Returns the space, one of lines and circles in closed form.
+    """Returns the space; a product of lines and circles as one :class:`Flat`.
 
     Args:
-        name: its own, for the message.
+        name: the argument's name, for the message.
         space: a space; ``None`` for plain numbers.
-        flat: whether it must be one of lines and circles.
+        flat: whether only lines and circles are allowed.
 
     Raises:
-        TypeError: for what is no space.
-        ValueError: for another space than one of lines and circles, where it must be one.
+        TypeError: if it is no space.
+        ValueError: with ``flat``, for a space with other parts than lines and circles.
 
     Example:
         >>> from torch_denkf.functional.manifolds import Circle, Euclidean
@@ -226,12 +226,12 @@ def check_space(name: str, space: Space | None, *, flat: bool = False) -> Space 
     if not isinstance(space, Space):
         raise TypeError(f"{name} is a Space, such as SO3() or Product(SE2(), Euclidean(2)); got {space!r}"[:200])
     if flat and space.flat is None:
-        raise ValueError(f"{name} is one of numbers and angles here, such as Euclidean(2) * Circle(); got {space}.")
+        raise ValueError(f"{name} must be made of numbers and angles, such as Euclidean(2) * Circle(); got {space}.")
     return space.flat or space
 
 
 def is_flat(*spaces: Space | None) -> bool:
-    """Returns whether the formulas of plain numbers hold: all are plain numbers, or lines and circles."""
+    """Tells whether the formulas of plain numbers hold: each space is ``None``, or has lines and circles only."""
     return all(space is None or space.flat is not None for space in spaces)
 
 
@@ -247,6 +247,6 @@ def side_by_side(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor
 
 
 def blocks(parts: Sequence[Tensor]) -> Tensor:
-    """Returns matrices on the diagonal of one."""
+    """Returns a block-diagonal matrix."""
     sizes = [part.shape[-1] for part in parts]
     return torch.cat([pad(part, (sum(sizes[:at]), sum(sizes[at + 1 :]))) for at, part in enumerate(parts)], -2)

@@ -1,4 +1,4 @@
-"""The run of a smoother: from the last belief of a sequence back to the first."""
+"""The backward pass of a smoother: from the last belief of a sequence to the first."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def run_backward(
     """Smooths the beliefs of a whole sequence.
 
     Args:
-        step: smooths beliefs, given what links them to those of one time later, and these smoothed.
+        step: returns smoothed beliefs, from the beliefs, their links to the next time, and its smoothed beliefs.
         time: the dimension of time, behind those of the batch.
         beliefs: entries of the filter's beliefs, ``[*B, T, *]``.
-        links: what was computed on the way to each time from the belief before it, ``[*B, T, *]``.
-        follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it. None: all follow.
-        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
+        links: entries computed in the step from the belief before to each time, ``[*B, T, *]``.
+        follows: boolean ``[*B, T]``; False if an element is not one step on from the one before. None: all are.
+        lag: number of later readings: the belief of t given those up to t + lag. None: all of the sequence.
 
     Returns:
         The smoothed entries, ``[*B, T, *]`` each.
@@ -56,7 +56,7 @@ def run_backward(
             out.append(back(t, 1, out[-1]))
         return tuple(torch.cat(values, time) for values in zip(*out[::-1], strict=True))
     smoothed = list(beliefs)
-    for _ in range(lag):  # all times at once: each round takes in one more reading
+    for _ in range(lag):  # all times at once: each round adds one more later reading
         moved = back(0, last, [value.narrow(time, 1, last) for value in smoothed])
         smoothed = [torch.cat(both, time) for both in zip(moved, end, strict=True)]
     return tuple(smoothed)
@@ -65,4 +65,4 @@ def run_backward(
 def check_lag(lag: int | None) -> None:
     """Raises unless ``lag`` is ``None`` or a whole number, 0 or more."""
     if lag is not None:
-        check_count("lag", lag, least=0, cure="It counts the later readings that are used; None is for all")
+        check_count("lag", lag, least=0, cure="It is the number of later readings; None uses all")

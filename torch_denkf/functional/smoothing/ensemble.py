@@ -1,9 +1,9 @@
-"""Ensemble smoothers: the members of an earlier time, corrected by later readings.
+"""Ensemble smoothers: correct the members of an earlier time by later readings.
 
-Both use that members are paired in time: member i at t + 1 is the forecast of member i at t. An update that mixes the
-pairing up, such as a random rotation of the members after each analysis, takes their ground away.
+Both need members that are paired in time: member i at t + 1 is the forecast of member i at t. An update that breaks
+the pairing, such as a random rotation of the members after each analysis, makes them invalid.
 
-Sources: Evensen & van Leeuwen 2000 (the ensemble Kalman smoother, which is an analysis of the past's members); Raanes
+Sources: Evensen & van Leeuwen 2000 (the ensemble Kalman smoother, an analysis of past members); Raanes
 2016, Q. J. R. Meteorol. Soc. 142 (the ensemble Rauch-Tung-Striebel smoother, and how the two compare).
 """
 
@@ -28,11 +28,11 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
 
     Args:
         ensemble: X, the filter's belief at t, ``[*B, E, S]``.
-        forecast: X_f of t + 1, the same members one step on, ``[*B, E, S]``.
+        forecast: X_f of t + 1, the forecasts of the same members, ``[*B, E, S]``.
         smoothed: X_s of t + 1, ``[*B, E, S]``.
-        damping: factor on the gain. Where the filter inflates its members by a factor r, the gains carry the inflation
-            back, r times more in each step, in directions that no reading holds: damping below 1 / r keeps a long way
-            back stable (``DeCorr`` in DAPPER).
+        damping: factor of the gain. If the filter inflates its members by a factor r, the gains carry the inflation
+            back, r times more in each step, in unobserved directions: damping below 1 / r keeps a long backward pass
+            stable (``DeCorr`` in DAPPER).
 
     Returns:
         The smoothed members of t, ``[*B, E, S]``.
@@ -41,7 +41,7 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
         ValueError: if the shapes do not fit, or ``damping`` is not in (0, 1].
 
     Examples:
-        Members that double in each step, and at t + 1 turn out to be 1 larger:
+        Members that double in each step, and are 1 larger at t + 1 after smoothing:
 
         >>> import torch
         >>> members = torch.tensor([[-1.0], [1.0]])
@@ -51,10 +51,10 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     check_ensemble("ensemble", ensemble, min_size=2)
     for name, value in (("forecast", forecast), ("smoothed", smoothed)):
         check_shape(name, value, ensemble.shape, "[*B, E, S]")
-    check_number("damping", damping, above=0, most=1, cure="It is a factor on the gain")
+    check_number("damping", damping, above=0, most=1, cure="It is a factor of the gain")
     size, dim = ensemble.shape[-2:]
     anomalies, forecast_anomalies = ensemble_anomalies(ensemble), ensemble_anomalies(forecast)
-    # Where all members are alike, what they have besides their mean is rounding, and no direction to learn from.
+    # If all members are equal up to rounding, their anomalies have no information.
     spread = forecast_anomalies.square().mean(-2, keepdim=True).detach().sqrt()
     alike = spread <= 4 * torch.finfo(forecast.dtype).eps * forecast.abs().amax(-2, keepdim=True).detach()
     forecast_anomalies = torch.where(alike, 0, forecast_anomalies)
@@ -62,13 +62,13 @@ def enrts_step(ensemble: Tensor, forecast: Tensor, smoothed: Tensor, *, damping:
     if dim < size:
         cross = forecast_anomalies.mT @ anomalies
         return ensemble + shift @ semidefinite_solve(forecast_anomalies.mT @ forecast_anomalies, cross)
-    # In units of the spread, so that metres and milliradians count alike. The anomalies sum to zero: the eigenvalue of
-    # the vector of ones is free, and at the mean of the diagonal the system keeps its digits.
+    # Scaled by the spread, so that units do not matter. The anomalies sum to zero: the eigenvalue of the vector of ones
+    # can be chosen, and at the mean of the diagonal the system keeps its digits.
     scale = torch.where(alike, 0, 1 / torch.where(alike, 1, spread))
     scaled = forecast_anomalies * scale
     gram = scaled @ scaled.mT
     level = gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
-    level = torch.where(level > 0, level, 1)  # members without any spread: nothing is learned, and nothing is singular
+    level = torch.where(level > 0, level, 1)  # without any spread: no correction, and no singular system
     ridge = 10 * size * torch.finfo(gram.dtype).eps
     identity = torch.eye(size, dtype=gram.dtype, device=gram.device)
     weights = solve(gram + level * (1 / size + ridge * identity), scaled @ (shift * scale).mT)
@@ -88,12 +88,12 @@ def enrts_smooth(
 
     Args:
         ensemble: the filter's beliefs, ``[*B, T, E, S]``.
-        forecast: of each time, the members before it one step on, ``[*B, T, E, S]``.
-        follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it. None: all follow.
-        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
+        forecast: forecasts of the members before, for each time, ``[*B, T, E, S]``.
+        follows: boolean ``[*B, T]``; False if an element is not one step on from the one before. None: all are.
+        lag: number of later readings: the belief of t given those up to t + lag. None: all of the sequence.
         damping: see :func:`enrts_step`.
-        space: in which the state lives: members are points, and :func:`enrts_step` is made with the tangents at the
-            mean of each time. ``None`` for plain numbers.
+        space: space of the state: members are points, and :func:`enrts_step` runs on the tangents at the mean of
+            each time. ``None`` for plain numbers.
 
     Returns:
         The smoothed ensembles, ``[*B, T, E, S]``.

@@ -1,4 +1,4 @@
-r"""Smoothing of particles: new weights for those of an earlier time.
+r"""Smoothing of particles: updates the weights at an earlier time.
 
 Source: Doucet, Godsill & Andrieu 2000, "On sequential Monte Carlo sampling methods for Bayesian filtering", section V
 (forward filtering, backward smoothing); Särkkä 2013, section 11.3.
@@ -31,7 +31,7 @@ def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: 
         ValueError: if the shapes do not fit.
 
     Examples:
-        Two particles, of which only the second can have led to the later one with all weight:
+        Two particles, of which only the second can be the ancestor of the one later particle that has weight:
 
         >>> import torch
         >>> even = torch.tensor([0.5, 0.5]).log()
@@ -50,14 +50,14 @@ def backward_weights(log_weights: Tensor, log_transition: Tensor, log_smoothed: 
 def backward_smooth(
     log_weights: Tensor, log_transition: Tensor, *, follows: Tensor | None = None, lag: int | None = None
 ) -> Tensor:
-    """Smooths the weights of a whole sequence of particles, which stay where they are.
+    """Smooths the weights of a whole sequence of particles, whose states are unchanged.
 
     Args:
-        log_weights: of the filter's beliefs, normalised, ``[*B, T, E]``.
+        log_weights: log-weights of the filter's beliefs, normalised, ``[*B, T, E]``.
         log_transition: log-density of each particle at t, in the columns, given each at t − 1, in the rows,
             ``[*B, T, E, E]``.
-        follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it. None: all follow.
-        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
+        follows: boolean ``[*B, T]``; False if an element is not one step on from the one before. None: all are.
+        lag: number of later readings: the belief of t given those up to t + lag. None: all of the sequence.
 
     Returns:
         The smoothed log-weights, ``[*B, T, E]``.

@@ -1,7 +1,7 @@
-r"""The Rauch-Tung-Striebel smoother: what later readings say about an earlier state, as a mean and a covariance.
+r"""The Rauch-Tung-Striebel smoother: conditions earlier states on later readings, as means and covariances.
 
-The step from t to t + 1 leaves a forecast m_f, P_f and the cross-covariance C of the state before and the state after
-it. With the gain :math:`G = C P_f^{-1}` the smoothed belief of t follows from that of t + 1. Only C differs between
+The step from t to t + 1 gives a forecast m_f, P_f and the cross-covariance C of the states before and after the step.
+With the gain :math:`G = C P_f^{-1}` the smoothed belief of t is computed from that of t + 1. Only C differs between
 filters: P Fᵀ in a Kalman filter, with the Jacobian F in an extended one, from sigma points in an unscented one.
 
 Source: Rauch, Tung & Striebel 1965; Särkkä 2013, theorem 8.2 and section 9 (for the EKF and the UKF).
@@ -19,7 +19,7 @@ from torch_denkf.functional.smoothing.backward import run_backward
 
 
 def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
-    """Returns the smoother's gain G = C P_f⁻¹, also for a singular P_f, whose eigenvalues rounding made negative.
+    """Returns the smoother's gain G = C P_f⁻¹; P_f may be singular, with eigenvalues that are negative by rounding.
 
     Args:
         cross: C, the covariance of the state at t and the state at t + 1, ``[*B, S, S]``, rows at t.
@@ -37,10 +37,10 @@ def smoothing_gain(cross: Tensor, forecast_cov: Tensor) -> Tensor:
 
 
 def left_open(gain: Tensor, before: Tensor, middle: Tensor, after: Tensor, noise: Tensor) -> Tensor:
-    """Returns the covariance of the state at t where that of t + 1 is known, in Joseph's form.
+    """Returns the covariance of the state at t given the state at t + 1, in Joseph's form.
 
-    (A − G B) M (A − G B)ᵀ + G Q Gᵀ equals P − G P_f Gᵀ. Round-off leaves it positive where P is far larger than Q, as
-    at the start of a run that knows little.
+    (A − G B) M (A − G B)ᵀ + G Q Gᵀ equals P − G P_f Gᵀ, and stays positive under round-off if P is far larger than Q,
+    as at the start of a run with a vague prior.
 
     Args:
         gain: G, ``[*B, S, S]``.
@@ -50,7 +50,7 @@ def left_open(gain: Tensor, before: Tensor, middle: Tensor, after: Tensor, noise
         noise: Q, ``[*B, S, S]``.
 
     Returns:
-        ``[*B, S, S]``.
+        The covariance, ``[*B, S, S]``.
 
     Examples:
         >>> import torch
@@ -76,25 +76,25 @@ def rts_step(
 ) -> tuple[Tensor, Tensor]:
     """Smooths one step back in time: the belief of t from that of t + 1.
 
-    The covariance is (P − G P_f Gᵀ) + G P_s Gᵀ: what the next state leaves open, and what is not known of that.
+    The covariance is (P − G P_f Gᵀ) + G P_s Gᵀ: the uncertainty given the next state, plus that of the next state.
 
     Args:
-        mean: of the filter's belief at t, ``[*B, S]``.
+        mean: mean of the filter's belief at t, ``[*B, S]``.
         cov: P, its covariance, ``[*B, S, S]``.
-        forecast_mean: of t + 1, ``[*B, S]``.
+        forecast_mean: mean of the forecast of t + 1, ``[*B, S]``.
         gain: G, see :func:`smoothing_gain`, ``[*B, S, S]``.
         cross: C, the covariance of the states at t and t + 1 in that forecast, ``[*B, S, S]``, rows at t.
-        smoothed_mean: of t + 1, ``[*B, S]``.
+        smoothed_mean: smoothed mean of t + 1, ``[*B, S]``.
         smoothed_cov: P_s of t + 1, ``[*B, S, S]``.
         open_cov: P − G P_f Gᵀ, see :func:`left_open`; ``None`` for the difference itself, P − G Cᵀ.
-        space: in which the state lives: means are points, and each covariance is of the tangents at its mean. ``None``
+        space: space of the state: means are points, and each covariance is of the tangents at its mean. ``None``
             for plain numbers.
 
     Returns:
         The smoothed mean ``[*B, S]`` and covariance ``[*B, S, S]`` of t.
 
     Examples:
-        A random walk with P = Q = 1, whose next state turns out to be 2, exactly:
+        A random walk with P = Q = 1, whose next state is known to be 2 exactly:
 
         >>> import torch
         >>> zero, one = torch.zeros(1), torch.ones(1, 1)
@@ -130,16 +130,16 @@ def rts_smooth(
     """Smooths the beliefs of a whole sequence.
 
     Args:
-        mean: of the filter's beliefs, ``[*B, T, S]``.
+        mean: means of the filter's beliefs, ``[*B, T, S]``.
         cov: their covariances, ``[*B, T, S, S]``.
-        forecast_mean: of each time, made from the belief before it, ``[*B, T, S]``.
+        forecast_mean: mean of the forecast of each time from the belief before, ``[*B, T, S]``.
         forecast_cov: its covariance, ``[*B, T, S, S]``.
         cross: the covariance of the state before and the state at each time, ``[*B, T, S, S]``, rows before.
-        open_cov: of the step to each time, see :func:`rts_step`, ``[*B, T, S, S]``.
-        follows: boolean ``[*B, T]``; False where an element is not a step on from the one before it, such as the first
-            of an episode: nothing flows back from there. The first element's is not read. None: all follow.
-        lag: how many later readings count: the belief of t given those up to t + lag. None: all of the sequence.
-        space: in which the state lives, see :func:`rts_step`.
+        open_cov: see :func:`rts_step`, for the step to each time, ``[*B, T, S, S]``.
+        follows: boolean ``[*B, T]``; False if an element is not one step on from the one before, such as the first
+            of an episode: no correction passes back from it. The first element is ignored. None: all are.
+        lag: number of later readings: the belief of t given those up to t + lag. None: all of the sequence.
+        space: space of the state, see :func:`rts_step`.
 
     Returns:
         The smoothed means ``[*B, T, S]`` and covariances ``[*B, T, S, S]``.
@@ -158,7 +158,7 @@ def rts_smooth(
     check_shape("forecast_mean", forecast_mean, mean.shape, "[*B, T, S]")
     for name, value in (("cov", cov), ("forecast_cov", forecast_cov), ("cross", cross)):
         check_shape(name, value, (*mean.shape[:-1], size, size), "[*B, T, S, S]")
-    # Those of all times in one call; there is none to the first.
+    # The gains of all times in one call; the first time has none.
     gains = smoothing_gain(cross[..., 1:, :, :], forecast_cov[..., 1:, :, :])
     gain = torch.cat([torch.zeros_like(cross[..., :1, :, :]), gains], -3)
     links = (forecast_mean, gain, cross, *(() if open_cov is None else (open_cov,)))

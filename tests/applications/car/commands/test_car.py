@@ -24,7 +24,7 @@ def odometry(root, checkpoint, out, *words):
     return main([str(word) for word in (*given, "--out", out, *words)])
 
 
-def test_a_training_says_its_roles_and_knows_its_command(root, training, capsys):
+def test_training_prints_roles_and_command(root, training, capsys):
     folder, said = training
     assert "roles: validation: " in said
     assert f"denkf evaluate --checkpoint {folder}" in said
@@ -90,22 +90,16 @@ def test_missing_numbers_are_missing_frames(root, checkpoint, tmp_path, capsys):
 
 
 MISTAKES = {
-    "--checkpoint EMPTY --fps 10": r"no (trained )?filter .*empty",
     "--calibration CAMERA --fps 10": "does not belong to images of 75 x 25 pixels",
-    "--height 165 --fps 10": "height must be .* It is that of the camera over the road, in m",
     "--fps 10 --times CAMERA": "--fps or --times, not both",
-    "--times CAMERA": r"camera\.txt:1: expected a time in s",
-    "--times MANY": "many.txt has 99 times, but .*image_2 has 16 frames; pass a row for each",
 }
 
 
 @pytest.mark.parametrize(("words", "pattern"), MISTAKES.items(), ids=MISTAKES)
 def test_mistakes_are_one_line(words, pattern, root, checkpoint, tmp_path, capsys):
-    files = {"EMPTY": tmp_path / "empty", "CAMERA": tmp_path / "camera.txt", "MANY": tmp_path / "many.txt"}
-    files["EMPTY"].mkdir()
-    files["CAMERA"].write_text("fx=718 fy=718 cx=607 cy=185")
-    files["MANY"].write_text("".join(f"{0.1 * n}\n" for n in range(99)))
-    assert odometry(root, checkpoint, tmp_path / "out", *(files.get(word, word) for word in words.split())) == 2
+    (tmp_path / "camera.txt").write_text("fx=718 fy=718 cx=607 cy=185")
+    words = words.replace("CAMERA", str(tmp_path / "camera.txt")).split()
+    assert odometry(root, checkpoint, tmp_path / "out", *words) == 2
     err = capsys.readouterr().err
     assert err.startswith("error: ")
     assert err.count("\n") == 1

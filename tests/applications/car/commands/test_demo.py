@@ -25,7 +25,7 @@ def test_demo_of_a_rendered_drive(tmp_path, capsys, monkeypatch):
     assert len(tracked[0]) == 36
     assert re.search(rf"DEnKF +{scores['filter_end_m']:.1f} m .* {scores['filter_mean_m']:.1f} m", said)
     assert re.search(rf"dead reckoning +{scores['reckoned_end_m']:.1f} m .* {scores['reckoned_mean_m']:.1f} m", said)
-    assert f"hold {100 * scores['held_v']:.0f} % of the true speeds" in said
+    assert f"90 % coverage of the DEnKF: speed {100 * scores['held_v']:.0f} %" in said
     with Image.open(tmp_path / "demo.gif") as animation:
         assert animation.size == (800, 500)
         assert animation.n_frames == 3

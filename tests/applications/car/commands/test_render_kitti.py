@@ -17,7 +17,7 @@ cv2.setNumThreads(1)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A folder with pose files of two drives."""
+    """Writes a folder with pose files of two drives."""
     folder = tmp_path_factory.mktemp("recorded")
     for seed, name in enumerate(("00", "01")):
         rng = np.random.default_rng(seed)
@@ -78,28 +78,6 @@ def test_bytes_depend_neither_on_processes_nor_on_interruptions(recorded, tmp_pa
     assert written == [12, 5, 5, 2]
     assert first.stat().st_mtime_ns == before
     assert content(tmp_path / "three") == expected
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "match"),
-    [
-        ({"poses": "none"}, FileNotFoundError, r"no pose files NAME\.txt in .*; pass the folder"),
-        ({"names": ["00", "07"]}, FileNotFoundError, r"no pose files for \['07'\] in .*; it has \['00', '01'\]"),
-        ({"poses": "bad"}, ValueError, r"03\.txt:2: expected 12 finite numbers .*got 11 words"),
-        ({"frames": 1}, ValueError, "at least 2 frames, got 1"),
-        ({"poses": None, "camera": "image_9"}, ValueError, r"camera is one of .*got 'image_9'"),
-        ({"poses": None, "focal": 718.856}, ValueError, "focal length as a share of the width"),
-        ({"poses": None, "processes": 0}, ValueError, "processes must be at least 1, got 0"),
-    ],
-)
-def test_errors_name_the_file_and_the_remedy(options, error, match, recorded, tmp_path):
-    for name in ("none", "bad"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "bad/03.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1\n")
-    poses = options.get("poses", recorded)
-    with pytest.raises(error, match=match):
-        render_drives(tmp_path / "out", **{**options, "poses": poses if poses is None else tmp_path / poses})
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_drive_that_is_there_stays(tmp_path):

@@ -10,12 +10,7 @@ from torch.testing import assert_close
 from tests.real_data import KITTI, SHARED
 from torch_denkf.applications.car.corners.camera import StereoCamera
 from torch_denkf.applications.car.corners.drive import corner_replay, read_corner_drive
-from torch_denkf.applications.car.corners.motion import (
-    CornerNoise,
-    corner_motion,
-    corner_motions,
-    started_by_ransac,
-)
+from torch_denkf.applications.car.corners.motion import CornerNoise, corner_motion, corner_motions, started_by_ransac
 from torch_denkf.applications.car.kitti.files import read_poses
 from torch_denkf.applications.car.metrics.devkit import kitti_devkit_error
 from torch_denkf.envs import ReplayEnv
@@ -31,7 +26,7 @@ def _double(float64):
 
 
 def drawn(batch=20, count=60, noise=None, seed=0):
-    """Points ahead, a motion of a metre, and the corners of both rows."""
+    """Returns points ahead, a motion of a metre, and the corners of both rows."""
     torch.manual_seed(seed)
     points = torch.randn(batch, count, 3) * torch.tensor([8.0, 2.0, 10.0]) + torch.tensor([0.0, 0.0, 25.0])
     points[..., 2] = points[..., 2].clamp_min(5.0)
@@ -44,7 +39,7 @@ def drawn(batch=20, count=60, noise=None, seed=0):
     return *corners, torch.ones(batch, count, dtype=torch.bool), motion
 
 
-def test_a_camera_projects_what_it_has_seen():
+def test_camera_projects_reconstructed_points():
     before, *_ = drawn()
     torch.testing.assert_close(CAMERA.project(CAMERA.points(before)), before)
     points = CAMERA.points(before)
@@ -80,7 +75,7 @@ def test_wrong_corners_are_left_out():
     assert found.weight[:, ::5].median() < 0.01 * found.weight[:, 1::5].median()
 
 
-def test_what_a_rectification_has_left_is_taken_off():
+def test_residual_distortion_is_removed():
     """A corner is moved outwards, and its right image so far that its disparity is short of a polynomial."""
     radial, short = (0.004, 0.03, -0.01), (0.4, 0.3, 0.0, 0.0, -2.0, 0.0, 1.0)
     camera = replace(CAMERA, radial=radial, disparity_offset=short)

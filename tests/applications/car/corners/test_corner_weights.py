@@ -47,7 +47,7 @@ def test_weights_and_likelihood_are_students():
     assert_close(found.stereo_var, torch.full((12,), 0.5**2))
 
 
-def test_a_disparity_is_held_above_half_a_pixel():
+def test_disparity_is_clamped_at_half_a_pixel():
     """A corner in the middle of the picture, whose disparity must be less: what is left of it is that of half a pixel.
 
     The camera goes 5 m ahead, of 10 m where the disparity is a half: it doubles, and by t = 4 what goes through.
@@ -103,7 +103,7 @@ def rows(came_from, seen):
     return TensorDict({**out, "repeats": torch.zeros(count, most, dtype=torch.int64)}, [count])
 
 
-def test_what_is_remembered_of_a_corner():
+def test_corner_memory():
     """Gives corners without an error the weight w = (freedom + 3) / freedom, and the variance goes by it.
 
     From row to row it is divided by w, and a walk is added. A corner that is new, or was not seen in the row before,

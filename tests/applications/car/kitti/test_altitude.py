@@ -14,7 +14,7 @@ def hills():
     return hilly_poses(random_drive(400, rng), rng)
 
 
-def test_hills_stay_as_they_are(hills):
+def test_hills_are_unchanged(hills):
     assert np.ptp(hills[:, 1, 3]) > 2  # m: there are some
     assert np.array_equal(steady_altitude(hills), hills)
 

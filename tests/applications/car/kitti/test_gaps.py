@@ -10,7 +10,7 @@ from torch_denkf.applications.car.kitti.gaps import bridge_gaps, steps_between
 
 
 def searched(valid, longest):
-    """Steps back to the last frame that is there, by looking."""
+    """Counts steps back to the last existing frame, by a loop."""
     steps = []
     for row, there in enumerate(valid):
         back = next((n for n in range(1, longest + 1) if row >= n and valid[row - n]), 0)

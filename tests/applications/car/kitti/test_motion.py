@@ -70,7 +70,7 @@ def wider(drive):
 
 
 @pytest.mark.parametrize("change", [one_pixel, mask, calibration, wider])
-def test_what_matters_makes_another_key(drive, tmp_path, count, change):
+def test_cache_key_depends_on_all_settings(drive, tmp_path, count, change):
     with_motion(drive, cache=tmp_path)
     changed = drive.clone()
     change(changed)

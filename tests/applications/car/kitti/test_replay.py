@@ -22,7 +22,7 @@ open_dataset = partial(KITTIOdometryExperienceReplay, size=SIZE, cache=None)
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """Three drives; a gap in the town, and a second camera in the town and the lane."""
+    """Writes three drives with a gap in the town, and a second camera in the town and the lane."""
     folder = tmp_path_factory.mktemp("kitti")
     for name, frames in LENGTHS.items():
         write_drives(folder, name, frames=frames, size=SIZE)
@@ -116,11 +116,6 @@ def test_cameras(tmp_path):
     assert (data[0]["calibration"] != data[6]["calibration"]).any()  # each camera has its own
     with pytest.raises(ValueError, match=r"01/image_0 has frames of {'image': \(1, .*00/image_3 has .*\(3, .*colour"):
         open_dataset(tmp_path, cameras="both", colour=None)
-    for wrong in ("all", "image_2", [], ["image_0", "image_0"]):
-        with pytest.raises(ValueError, match="cameras is 'first', 'both' or a sequence of folder names"):
-            open_dataset(tmp_path, cameras=wrong)
-    with pytest.raises(FileNotFoundError, match=r"no folder .*sequences/01/image_2"):
-        open_dataset(tmp_path, cameras=["image_2"], drives="01")
 
 
 def fails(error, match, root, **options):
@@ -129,7 +124,6 @@ def fails(error, match, root, **options):
 
 
 def test_folders_that_lack_something(tmp_path):
-    fails(FileNotFoundError, r"no folder .*sequences; pass the folder that holds 'sequences' and 'poses'", tmp_path)
     (tmp_path / "sequences").mkdir()
     fails(FileNotFoundError, r"no drive below .* has both images and poses: it is empty; download KITTI", tmp_path)
     make(tmp_path, sequence="05", images=[])
@@ -143,6 +137,3 @@ def test_folders_that_lack_something(tmp_path):
     fails(FileNotFoundError, r"no images in .*sequences/05; expected FFFFFF.png", tmp_path, drives=["02", "05"])
     fails(FileNotFoundError, r"no images in .*sequences/05", tmp_path, drives=["05"], cameras="both")
     fails(FileNotFoundError, r"no poses at .*poses/07.txt; download", tmp_path, drives=["07"])
-    fails(FileNotFoundError, r"no folder .*sequences/03; .* has \['02', '05', '07'\]", tmp_path, drives=[3])
-    for wrong in ([], ["02", 2]):
-        fails(ValueError, r"drives are names, each once, or None for all", tmp_path, drives=wrong)

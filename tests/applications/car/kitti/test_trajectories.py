@@ -12,7 +12,7 @@ TIMES = 0.103 * torch.arange(60, dtype=torch.float64)
 
 
 def drive():
-    """A path that turns through more than a whole turn, float64 [60, 5]."""
+    """Returns a path that turns through more than a whole turn, float64 [60, 5]."""
     theta = torch.linspace(-0.5, 7.0, 60, dtype=torch.float64)
     step = torch.stack([theta.cos(), theta.sin()], -1)
     return torch.cat([step.cumsum(0), theta.unsqueeze(-1), torch.ones(60, 2, dtype=torch.float64)], -1)

@@ -15,7 +15,7 @@ def straight(rows=201, step=1.0):
 
 
 def winding(seed, rows=400, step=None, batch=()):
-    """A bent path; steps of 0.5 to 1.5 m, or of one length."""
+    """Returns a bent path; steps of 0.5 to 1.5 m, or of one length."""
     rng = torch.Generator().manual_seed(seed)
     speed = 5 + 10 * torch.rand(*batch, rows, generator=rng, dtype=torch.float64)
     speed = speed if step is None else torch.full_like(speed, 10 * step)
@@ -25,7 +25,7 @@ def winding(seed, rows=400, step=None, batch=()):
 
 
 def matrices(path):
-    """Poses [T, 3] as SE(3) matrices, in the plane z = 0."""
+    """Returns poses [T, 3] as SE(3) matrices, in the plane z = 0."""
     out = np.tile(np.eye(4), (len(path), 1, 1))
     x, y, theta = path.T.numpy()
     out[:, 0, 0] = out[:, 1, 1] = np.cos(theta)

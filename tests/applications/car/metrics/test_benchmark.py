@@ -36,7 +36,7 @@ def test_a_window_of_all_steps_fits_and_one_more_does_not():
         metric(torch.zeros(200, 5), torch.zeros(200, 5))
 
 
-def test_what_the_pathlength_error_is_blind_to():
+def test_pathlength_error_ignores_cancelling_errors():
     truth = straight(101)
     backwards = truth * torch.tensor([-1.0, 1.0, 1.0])
     turned = kitti_pathlength_error(backwards, truth)

@@ -46,7 +46,7 @@ def test_the_definition_written_out():
         torch.testing.assert_close(error.length_rotation[k], rows[:, 2].mean(), equal_nan=True, atol=1e-7, rtol=1e-7)
 
 
-def test_errors_say_what_to_do():
+def test_invalid_input_raises():
     path = straight(90)
     with pytest.raises(ValueError, match=r"the shortest path is 89\.0 m long; leave such paths out"):
         kitti_devkit_error(path, path)
@@ -59,7 +59,7 @@ def test_errors_say_what_to_do():
 
 
 def in_space(path):
-    """A planar path (x, y, angle) as points of SE3, whose z is up."""
+    """Returns a planar path (x, y, angle) as points of SE3, whose z is up."""
     turn = SO3().exp(torch.cat([torch.zeros_like(path[..., :2]), path[..., 2:]], -1))
     return torch.cat([turn, path[..., :2], torch.zeros_like(path[..., :1])], -1)
 

@@ -21,7 +21,7 @@ def make(**kwargs):
 
 
 def draw_noise(sensor, batch, **options):
-    """Noise that can be indexed by rows, whatever it is made of."""
+    """Returns the noise that can be indexed by rows, whatever it is made of."""
     noise = sensor.draw_noise(batch, **options)
     return noise if isinstance(noise, torch.Tensor) else TensorDict(noise, batch)
 
@@ -33,7 +33,7 @@ def random_frames(*batch):
 
 
 def known_frame(pitch, distance, turn):
-    """One peak in the table, and a flow of ``turn`` that is the same everywhere ahead."""
+    """Returns a table with one peak, and a flow with the same ``turn`` everywhere ahead."""
     flow, road = 0.1 * torch.randn(FLOW_SHAPE), torch.zeros(ROAD_SHAPE)
     flow[0, 8:12, 28:51] = turn
     road[np.abs(ROAD_PITCHES - pitch).argmin(), np.abs(ROAD_SHIFTS - distance).argmin()] = 1.0
@@ -41,7 +41,7 @@ def known_frame(pitch, distance, turn):
 
 
 def known_travel(pitch, length=0.1):
-    """The flow of a camera that looks up by ``pitch`` from where it travels: away from a focus, near things faster."""
+    """Returns the flow of a camera whose pitch over the direction of travel is ``pitch``."""
     rows, columns = ((torch.arange(n) + 0.5) / n * 2 - 1 for n in (25, 79))
     down, right = torch.meshgrid(rows * 0.2708 - pitch, columns * 0.8625, indexing="ij")
     return torch.stack([right, down, torch.zeros(25, 79)]) * length * torch.rand(25, 79)
@@ -172,7 +172,7 @@ def test_unobserved_nan_rows_poison_nothing(columns):
     torch.testing.assert_close(out[[0, 2]], sensor(alone)["sensor", "ensemble"])
 
 
-def test_corners_tell_turn_and_pitch_where_there_are_any(float64):
+def test_corners_determine_turn_and_pitch(float64):
     sensor = only_the_road(make(two_view_key="two_view"))
     trunk = sensor.module["trunk"]
     silence(trunk.corner_gate)

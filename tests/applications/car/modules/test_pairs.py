@@ -92,7 +92,7 @@ def test_the_way_over_a_gap_is_that_of_the_corrected_steps(float64):
         assert out["belief", "history"][0].tolist() == [[5.0, 0.4], list(path[1])]
 
 
-def test_what_is_out_of_reach_is_not_read(float64):
+def test_out_of_range_pairs_are_masked(float64):
     frames = frames_of(torch.full((4, 2), 9.0), [0, 0, 0, 3])
     frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.1]).expand(4, 5)
     torch.manual_seed(0)
@@ -103,7 +103,7 @@ def test_what_is_out_of_reach_is_not_read(float64):
     assert far["belief", "ensemble"].equal(blind["belief", "ensemble"])
 
 
-def test_neighbours_are_read_however_fast_the_filter_believes_itself(float64):
+def test_neighbouring_frames_are_read_at_any_believed_speed(float64):
     """Otherwise a filter whose speed has run away stays blind, and keeps it."""
     frames = frames_of(torch.full((12, 2), 4.0) * torch.tensor([1.0, 0.0]), [0, *[1] * 11])
     frames["state"] = torch.tensor([0.0, 0.0, 0.0, 60.0, 0.0]).expand(12, 5)
@@ -114,9 +114,9 @@ def test_neighbours_are_read_however_fast_the_filter_believes_itself(float64):
 
 
 def test_a_slow_camera_is_read_again_when_the_car_slows_down(float64):
-    """Keeps what the filter hardly knows within reach: else a speed that is believed too large stays for ever."""
+    """Keeps pairs in range under a large variance: else an overestimated speed would never be corrected."""
     frames = frames_of(torch.full((91, 2), 6.0) * torch.tensor([1.0, 0.0]), [0] + [0, 0, 3] * 30)
-    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0]).expand(91, 5)  # believed; in truth 3 x 2 m/s
+    frames["state"] = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0]).expand(91, 5)  # estimate; the true speed is 3 x 2 m/s
     torch.manual_seed(0)
     out = pair_filter(64, reach=[10.0, torch.inf]).sequence(frames)
     read = out["forecast", "observed"].squeeze(-1)

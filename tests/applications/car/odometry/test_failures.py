@@ -16,7 +16,7 @@ from torch_denkf.cli.main import main
 from torch_denkf.pretrained import from_pretrained
 
 
-def test_what_stands_still_before_the_camera_is_told_and_looked_past(tmp_path, capsys):
+def test_static_occlusion_is_detected_and_ignored(tmp_path, capsys):
     """The share that is told is the box's; pairs without it are read as ever."""
     write_drives(tmp_path, ["town"], frames=14, size=(100, 300))
     drive = read_kitti_drive(tmp_path, "town", size=(100, 300), cache=None)
@@ -48,7 +48,7 @@ def test_what_stands_still_before_the_camera_is_told_and_looked_past(tmp_path, c
     assert path["hidden"].flatten().numpy() == pytest.approx(shares, rel=1e-6)
 
 
-def test_dead_reckoning_integrates_what_was_read(checkpoint, drive):
+def test_dead_reckoning_integrates_the_readings(checkpoint, drive):
     car = from_pretrained(checkpoint)
     failures = [CameraFailure("black", 6, 7)]
     tracked = track_failing_drive(car, drive, failures, seed=3)

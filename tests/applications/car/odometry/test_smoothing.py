@@ -9,7 +9,7 @@ from torch_denkf.smoothers import FixedLag
 LAG = 3
 
 
-def test_the_past_velocities_learn_and_the_past_pose_does_not():
+def test_cloned_velocities_are_corrected_and_the_cloned_pose_is_not():
     car, batch = car_filter(), [2, 9]
     members, features = car.settings.ensemble_size, car.sensor.encoding_features
     sensor = {"ensemble": torch.tensor([9.0, 0.02]) + 0.2 * torch.randn(*batch, members, 2)}

@@ -12,7 +12,7 @@ LONGEST = 3
 
 
 def readings(values, observed=True, longest=1):
-    """Reads by two members, half a unit beside the values; for n steps n times as much, as at a constant speed."""
+    """Reads by two members, half a unit off the values; for n steps n times as much, as at a constant speed."""
     values = torch.as_tensor(values)
     samples = values.unsqueeze(1) + torch.tensor([-0.5, 0.5])[None, :, None]
     spans = torch.stack([n * samples for n in range(1, LONGEST + 1)], 1)
@@ -24,7 +24,7 @@ def readings(values, observed=True, longest=1):
 
 
 @pytest.mark.parametrize("longest", [1, LONGEST])
-def test_a_lost_frame_blinds_its_own_pair_and_those_that_cannot_bridge_it(longest):
+def test_missing_frame_masks_the_pairs_that_use_it(longest):
     read = readings([[0.0, 0.0]] * 4000, longest=longest)
     lost = lose_frames(read, seed=3)
     kept = torch.rand(4000, generator=torch.Generator().manual_seed(3)) >= 0.3
@@ -58,7 +58,7 @@ def test_windows_are_faster_or_slower_worlds_that_agree_with_their_readings():
     assert windows["is_init"].sum() == 200
 
 
-def test_a_mirrored_drive_goes_the_mirrored_way():
+def test_mirrored_drive_has_a_mirrored_path():
     rng = torch.Generator().manual_seed(0)
     velocity = torch.rand(30, 2, generator=rng, dtype=torch.float64) + torch.tensor([5.0, -0.5])
     path = dead_reckoning(velocity, torch.zeros(3, dtype=torch.float64), 0.1)

@@ -25,7 +25,7 @@ def calibration_of(drive):
 
 
 def recorded(car):
-    """The filter, and a list that gets the noise of each of its steps."""
+    """Returns the filter, and a list that gets the noise of each of its steps."""
     noises, plain = [], car.draw_noise
 
     def draw(frame, **kwargs):
@@ -92,37 +92,9 @@ def test_times_with_a_gap_count_as_missing_frames(checkpoint, drive):
         list(track(car, images, calibration, times=far))
 
 
-FAR = (718.0, 718.0, 607.0, 185.0)
-ARGUMENTS = {
-    "three numbers": ({"calibration": (60.0, 60.0, 37.0)}, r"calibration is \(fx, fy, cx, cy\)"),
-    "a focal length of 0": ({"calibration": (0.0, 60.0, 37.0, 12.0)}, r"calibration is \(fx, fy, cx, cy\)"),
-    "cm": ({"height": 165}, r"height must be finite, at least 0\.3 and at most 5; got 165\. It is that of the camera"),
-    "degrees": ({"pitch": 2.0}, "pitch"),
-    "two clocks": ({"times": [0.0], "fps": 10}, "times or fps, not both"),
-    "no rate": ({"fps": 0}, "fps must be finite and above 0; got 0"),
-    "no level": ({"black_level": 300}, "black_level must be finite, at least 0 and at most 255; got 300"),
-    "back": ({"times": [0.0, 0.2, 0.1]}, r"times must increase; that of frame 2 is 0\.1 s, after 0\.2 s"),
-    "too few times": ({"times": [0.0, 0.1, 0.2]}, "frame 3 has none"),
-    "another camera": ({"calibration": FAR}, r"point \(607, 185\) does not belong to images of 75 x 25 pixels"),
-}
-IMAGES = {
-    "one image": (lambda images: [images[0], None], "no two frames at most 3 steps apart"),
-    "two sizes": (lambda images: [images[0], images[1][:24]], r"frame 1 is \[24, 75\], the first one \[25, 75\]"),
-    "floats": (lambda images: [images[0].astype(np.float32)], r"frame 0 is float32 \[25, 75\]; pass uint8"),
-}
-
-
-@pytest.mark.parametrize("what", [*ARGUMENTS, *IMAGES])
-def test_bad_input_says_what_to_do(what, checkpoint, drive):
-    options, match = ARGUMENTS.get(what, ({}, IMAGES.get(what, (None, None))[1]))
-    images = frames_of(drive) if what in ARGUMENTS else IMAGES[what][0](frames_of(drive))
-    with pytest.raises(ValueError, match=match):
-        list(track(from_pretrained(checkpoint), images, **{"calibration": calibration_of(drive), **options}))
-
-
 @pytest.fixture(scope="module")
 def moving(tmp_path_factory):
-    """A drive with traffic, 45 frames of 50 x 150."""
+    """Returns a drive with traffic, 45 frames of 50 x 150."""
     folder = tmp_path_factory.mktemp("moving")
     render_drives(folder, names=["m"], frames=45, camera="image_0")
     return read_kitti_drive(folder, "m", colour=False, cache=None)

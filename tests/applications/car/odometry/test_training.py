@@ -1,4 +1,4 @@
-"""A training leaves a filter that predicts better than before; a broken one goes on to the same weights."""
+"""A training leaves a filter that predicts better than before; a broken one continues to the same weights."""
 
 import csv
 import shutil
@@ -30,7 +30,7 @@ class Killed(Exception):
 
 @pytest.mark.slow  # tests/training/test_resume.py kills a training in all its stages
 @pytest.mark.parametrize("stage", ["filter", "end_to_end"])
-def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp_path, monkeypatch):
+def test_killed_training_resumes_to_equal_weights(stage, root, trained, tmp_path, monkeypatch):
     shutil.copytree(trained[0] / "cache", tmp_path / "cache")  # the optical flow
     plain = FilterTrainer._update
 
@@ -51,7 +51,7 @@ def test_a_killed_training_goes_on_to_the_same_weights(stage, root, trained, tmp
     assert resumed.inflation == trained[1].inflation
 
 
-def test_evaluation_beside_the_floor(trained, root, tmp_path, capsys):
+def test_evaluation_against_the_floor(trained, root, tmp_path, capsys):
     folder, car = trained
     options = {"cache": folder / "cache", "draws": 2, "window": 10, "progress": False}
     rows, beliefs = evaluate_car_filter(car, root, ["b", "c"], **options)

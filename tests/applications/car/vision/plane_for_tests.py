@@ -54,7 +54,7 @@ def render(size, calibration, *, position=(0.0, 0.0), left=0.0, up=0.0, samples=
 
 
 def pair(size, calibration, *, distance=0.0, turn=0.0, up=0.0, nod=0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Two views: the car drives an arc of chord ``distance`` and turns by ``turn`` to the left.
+    """Returns two views: the car drives an arc of chord ``distance`` and turns by ``turn`` to the left.
 
     The camera looks up by ``up`` in the second one, and by ``nod`` less in the first.
     """

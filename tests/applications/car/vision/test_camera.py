@@ -27,7 +27,7 @@ DIRECTIONS = [(0.0, 0.0), (0.4, 0.1), (-0.5, -0.12), (0.7, 0.17), (-0.75, 0.2)]
 
 
 def spot(size, column, row, width):
-    """A Gaussian bump of ``width`` pixels, uint8."""
+    """Returns a Gaussian bump of ``width`` pixels, uint8."""
     v, u = np.mgrid[: size[0], : size[1]]
     return np.round(250 * np.exp(-((u - column) ** 2 + (v - row) ** 2) / (2 * width**2))).astype(np.uint8)
 

@@ -16,7 +16,7 @@ def rotation(left, up, around):
 
 
 def views(turn, focus, seed=0, count=200, way=0.8):
-    """Points 4 to 40 m off that a camera sees before and after it has turned and driven ``way`` metres."""
+    """Returns points at 4 to 40 m in both images of a camera that rotates and drives ``way`` metres."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(4, 40, count)
     points = np.stack([rng.uniform(-0.8, 0.8, count) * depth, rng.uniform(-0.25, 0.25, count) * depth, depth], 1)
@@ -80,7 +80,7 @@ def test_images_of_a_turn_give_the_turn(disturb):
     assert motion[-1] > 0.5
 
 
-def test_what_hides_the_scene_gives_no_corners():
+def test_occlusion_gives_no_corners():
     """A box that stands still fills most of a turning view: its corners do not turn."""
     image = texture()[:, :414]
     other = turned(image, 0.04)

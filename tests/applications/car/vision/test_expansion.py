@@ -35,7 +35,7 @@ def test_finds_the_motion_of_points_at_any_depth(float64, focus, turn):
     torch.testing.assert_close(found.turn[0], torch.tensor(turn), rtol=0, atol=4e-4)
 
 
-def test_ignores_what_moves_on_its_own(float64):
+def test_moving_objects_are_ignored(float64):
     """A car over a tenth of the picture, and a corner that is not trusted."""
     flow = flow_of((0.02, -0.02), (0.003, 0.0, 0.0), 0.02 + 0.1 * torch.rand(25, 79))
     clean = focus_of_expansion(flow.unsqueeze(0))
@@ -47,7 +47,7 @@ def test_ignores_what_moves_on_its_own(float64):
     torch.testing.assert_close(found.turn, clean.turn, rtol=0, atol=2e-4)
 
 
-def test_standing_still_it_knows_that_it_does_not_know(float64):
+def test_covariance_is_large_at_standstill(float64):
     found = focus_of_expansion(torch.zeros(2, *FLOW_SHAPE))
     torch.testing.assert_close(found.focus, torch.tensor([[0.0, -0.01]] * 2))
     torch.testing.assert_close(found.focus_std, torch.tensor([[0.06, 0.05]] * 2), rtol=0.05, atol=0)

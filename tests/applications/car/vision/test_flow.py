@@ -43,7 +43,7 @@ def test_a_shift_is_found_in_tangents(camera, right, down):
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_vectors_stand_on_the_current_image(camera):
+def test_flow_vectors_are_located_in_the_current_image(camera):
     """Enlarged by s about the middle, what is at p was at p / s: the vector there is p (1 - 1/s), not p (s - 1)."""
     s, texture = 1.1, random_texture(5, blur=2.5)
     columns, rows = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in (camera.width, camera.height)))

@@ -36,7 +36,7 @@ def peak(correlations):
 
 
 @pytest.mark.parametrize(("pitch", "turn"), [(-0.04, 0.0), (-0.02, 0.03), (0.0, -0.03), (0.01, 0.0)])
-def test_the_table_tells_the_pitch(pitch, turn):
+def test_table_determines_the_pitch(pitch, turn):
     """A wrong pitch stretches near and far differently, so that they do not agree on a distance."""
     row = row_of(pitch)
     for distance in (1.0, 2.0):

@@ -35,7 +35,7 @@ def covered(images, grey=0):
 
 
 @pytest.mark.parametrize("grey", [0, 90])
-def test_what_stands_still_is_found_and_nothing_else(grey):
+def test_static_occlusion_is_detected_and_nothing_else(grey):
     region = static_region(*covered(changing(), grey))
     expected = np.zeros((100, 300), bool)
     expected[30:70, 120:180] = True  # whole cells of five pixels
@@ -44,7 +44,7 @@ def test_what_stands_still_is_found_and_nothing_else(grey):
     assert region.sum() >= expected.sum() - 4 * 25
 
 
-def test_a_camera_that_stands_a_white_sky_and_a_speck_are_no_fault():
+def test_standstill_white_sky_and_speck_are_no_fault():
     one, other = changing()
     assert not static_region(one, one).any()
     assert not static_region(*covered([one, other], 255)).any()
@@ -67,7 +67,7 @@ def test_signs_are_shares_and_a_ratio():
 
 
 def plane_flow(distance, turn=(0.0, 0.0, 0.0), focus=(0.0, 0.0)):
-    """The flow of a level road, and of a far wall above it."""
+    """Returns the flow of a level road, and of a far wall above it."""
     x, y = coarse_cells()
     left, up, around = turn
     inverse = (y - focus[1]).clamp_min(0.02) / HEIGHT
@@ -78,7 +78,7 @@ def plane_flow(distance, turn=(0.0, 0.0, 0.0), focus=(0.0, 0.0)):
 
 @pytest.mark.parametrize("distance", [0.3, 1.2, 2.5])
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.02, -0.003, 0.004)])
-def test_the_plane_tells_the_distance_whatever_the_turn(distance, turn):
+def test_plane_distance_is_independent_of_the_turn(distance, turn):
     found = plane_distance(plane_flow(distance, turn, focus=(0.01, -0.015)), height=HEIGHT)
     assert found.item() == pytest.approx(distance, rel=0.03)
 

@@ -30,6 +30,6 @@ def write_folder(folder, demos):
 
 
 def ten_demos(tmp_path_factory):
-    """A folder of ten demos of various lengths, three pictures in each."""
+    """Returns a folder of ten demos of various lengths, three pictures in each."""
     demos = [make_demo(number, rows) for number, rows in enumerate(LENGTHS)]
     return write_folder(tmp_path_factory.mktemp("demos"), demos)

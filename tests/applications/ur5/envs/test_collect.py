@@ -28,7 +28,7 @@ def demos_of(root):
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
-    """Three demos of one run in this process, without pictures."""
+    """Collects three demos in this process, without images."""
     root = tmp_path_factory.mktemp("unbroken")
     counts = []
     assert collect_ur5_demos(root, DEMOS, **BLIND, progress=counts.append) == DEMOS
@@ -99,7 +99,7 @@ def test_pictures_are_of_their_steps(tmp_path, domain):
     assert (data[:]["pixels"].numpy()[:4] == demos_of(tmp_path)[0].pixels.astype(np.float32) / 255).all()
 
 
-def test_an_interrupted_run_goes_on(unbroken, tmp_path):
+def test_interrupted_run_resumes(unbroken, tmp_path):
     """``tests/deployment`` shows that workers end with a killed parent, and that a second process must wait."""
     made = []
 

@@ -44,7 +44,7 @@ def test_few_frames_of_an_episode():
     assert (rollout["next", "pixels"].sum((1, 2, 3)) > 0).equal(drawn[-1][1:])
 
 
-def test_a_state_is_drawn_as_it_was_seen():
+def test_rendered_state_equals_the_recorded_image():
     env = make("put_down", seed=3)
     rollout = env.rollout(30, UR5Expert())
     seen, state = rollout["next", "pixels"][-1], rollout["next", "state"]

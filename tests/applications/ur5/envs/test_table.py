@@ -66,7 +66,7 @@ def test_state_is_the_simulators():
     np.testing.assert_allclose(state[7:], data.site("pinch").xpos - data.site("table_centre").xpos, atol=1e-6)
 
 
-def test_the_arm_goes_where_it_is_sent():
+def test_arm_reaches_its_target():
     env = blind(seed=2)
     rollout = env.rollout(350, UR5Expert(env))
     action, state = rollout["action"], rollout["next", "state"]

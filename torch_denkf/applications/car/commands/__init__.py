@@ -1,1 +1,1 @@
-"""The car's commands of the terminal."""
+"""Terminal commands of the car application."""

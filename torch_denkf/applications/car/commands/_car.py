@@ -1,4 +1,4 @@
-"""The car filter that a command runs."""
+"""Loads the car filter of a command."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _NAMES = {
 
 @dataclass
 class Demo(Command):
-    """Track a car by one camera that fails, with a filter that comes with the library: a picture and an animation."""
+    """Track a car by one camera that fails, with a pretrained filter: a picture and an animation."""
 
     out: Path = Path("runs/demo")  # folder for demo.png and demo.gif
     root: Path | None = None  # folder in KITTI's layout; without it a drive is rendered
@@ -108,15 +108,11 @@ class Demo(Command):
 
 
 def _table(scores: dict[str, float]) -> str:
-    """Formats three lines on a drive."""
+    """Formats the errors and the coverage of a drive."""
     way = scores["way_m"]
-    lines = [
-        f"{'':16}{'off at the end':>18}{'off on average':>18}   after {way:.0f} m with a camera that failed 3 times"
-    ]
+    lines = [f"{'':16}{'end-point error':>18}{'mean error':>18}   after {way:.0f} m with a camera that failed 3 times"]
     for label, name in (("DEnKF", "filter"), ("dead reckoning", "reckoned")):
         end, mean = scores[f"{name}_end_m"], scores[f"{name}_mean_m"]
         lines.append(f"{label:16}{f'{end:.1f} m ({100 * end / way:.1f} %)':>18}{f'{mean:.1f} m':>18}")
-    held = (
-        f"{100 * scores['held_v']:.0f} % of the true speeds, {100 * scores['held_theta_dot']:.0f} % of the turn rates"
-    )
-    return "\n".join([*lines, f"The DEnKF's 90 % intervals hold {held}."])
+    coverage = f"speed {100 * scores['held_v']:.0f} %, turn rate {100 * scores['held_theta_dot']:.0f} %"
+    return "\n".join([*lines, f"90 % coverage of the DEnKF: {coverage}."])

@@ -43,7 +43,7 @@ class Evaluate(Command):
     example = "denkf evaluate --checkpoint runs/car --root KITTI --drives 09 10 --out runs/car/evaluation"
 
     def run(self) -> None:
-        """Evaluates, and writes what was found."""
+        """Evaluates, and writes the results."""
         from torch_denkf.applications.car.commands._car import load_car, set_threads
         from torch_denkf.applications.car.kitti.episodes import find_drives
         from torch_denkf.applications.car.odometry.evaluation import evaluate_car_filter, markdown_table, write_rows

@@ -6,8 +6,8 @@
     denkf odometry KITTI/sequences/09/image_0 --calibration KITTI/sequences/09/calib.txt \
         --times KITTI/sequences/09/times.txt --checkpoint runs/car --out runs/09
 
-Leaves ``path.csv`` (pose, velocities, and standard deviations of all), ``path_kitti.txt`` and ``path_tum.txt`` (which
-evo reads), and pictures where matplotlib is installed. See :func:`torch_denkf.applications.car.track`, which does the
+Writes ``path.csv`` (pose, velocities, and standard deviations of all), ``path_kitti.txt`` and ``path_tum.txt`` (which
+evo reads), and plots if matplotlib is installed. See :func:`torch_denkf.applications.car.track`, which does the
 work.
 """
 
@@ -30,7 +30,7 @@ from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["Odometry"]
 
-#: Share of the usual time between frames by which one may be off; containers round to milliseconds.
+#: Tolerance of the time between frames, as a share of the median; containers round to milliseconds.
 _UNEVEN = 0.2
 
 
@@ -41,15 +41,15 @@ class Odometry(Command):
     frames: Positional[Path]  # folder of images, in the order of names; or a video
     calibration: Path  # KITTI's calib.txt; or a text or YAML file: fx, fy, cx, cy in pixels
     out: Path  # folder for path.csv, trajectory files and pictures
-    checkpoint: str = "car-odometry"  # that of the library, or a folder that denkf train left
+    checkpoint: str = "car-odometry"  # a pretrained filter, or a folder of denkf train
     camera: str | None = None  # of calib.txt; the name of the folder, where that is image_0 to image_3
     fps: float | None = None  # frames in a second; by default that of a video, or the times of its frames
     times: Path | None = None  # file with a time in s for each frame, a row each
     height: float = KITTI_HEIGHT  # of the camera over the road, m: it scales the path
-    pitch: float = 0.0  # how far the camera looks up from the road, rad
+    pitch: float = 0.0  # upward pitch of the camera, rad
     seed: int = 0  # of the filter's noise
-    black_level: int | None = 8  # frames that are black or of one colour to so many of 255 grey values are missing
-    repair: bool = True  # leave the flow as it is where something stands still before the moving camera
+    black_level: int | None = 8  # frames whose grey values span at most this much of 255 are missing
+    repair: bool = True  # do not continue the flow over static occlusions
     pictures: bool = True  # leave the pictures out
     threads: int = 1  # of torch and OpenCV
 
@@ -57,7 +57,7 @@ class Odometry(Command):
     example = "denkf odometry drive.mp4 --calibration camera.yaml --checkpoint runs/car --height 1.4 --out runs/drive"
 
     def run(self) -> None:
-        """Reads what is given, tracks, and writes the path as it comes."""
+        """Reads the inputs, tracks, and writes the path step by step."""
         if self.fps is not None and self.times is not None:
             raise ValueError("pass --fps or --times, not both")
         given = {"frames": self.frames, "calibration": self.calibration, "times": self.times}
@@ -97,7 +97,7 @@ class Odometry(Command):
 
 
 def _leave(beliefs, out: Path, *, pictures: bool) -> None:
-    """Writes the path, as it comes, and what follows from it."""
+    """Writes the path step by step, then trajectory files, a summary and plots."""
     import torch
 
     from torch_denkf.applications.car.kitti.trajectories import write_trajectory
@@ -138,7 +138,7 @@ def _leave(beliefs, out: Path, *, pictures: bool) -> None:
 
 
 def _times(file: Path | None, source) -> Sequence[float] | None:
-    """Returns the frames' times; of a file with a row for each number, those of the numbers that are there."""
+    """Returns the frames' times; for numbered frames, the rows of a file with those numbers."""
     if file is None:
         return None
     from torch_denkf.applications.car.odometry.images import read_times
@@ -155,7 +155,7 @@ def _times(file: Path | None, source) -> Sequence[float] | None:
 
 
 def _uneven(source) -> Sequence[float] | None:
-    """Returns the times that a video says its frames were taken at, where they are not evenly spaced."""
+    """Returns the time stamps of a video's frames, if they are not evenly spaced."""
     stamps = source.stamps()
     if stamps is None:
         return None

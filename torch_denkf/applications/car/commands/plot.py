@@ -1,4 +1,4 @@
-"""``denkf plot``: pictures of a path that ``denkf odometry`` left.
+"""``denkf plot``: plots of a path from ``denkf odometry``.
 
 ::
 
@@ -30,14 +30,14 @@ __all__ = ["Plot", "draw"]
 class Plot(Command):
     """Draw the path that denkf odometry found, with ellipses, and its velocities, with bands."""
 
-    path: Positional[Path]  # folder or CSV file that denkf odometry left
+    path: Positional[Path]  # folder or CSV file from denkf odometry
     out: Path | None = None  # folder for path.png and bands.png; that of the path by default
     level: float = 0.9  # probability of the bands and ellipses
 
     name, example = "plot", "denkf plot runs/drive"
 
     def run(self) -> None:
-        """Draws."""
+        """Draws the plots."""
         file = self.path / "path.csv" if self.path.is_dir() else self.path
         for written in draw(file, self.out or file.parent, self.level):
             say(str(written))
@@ -48,7 +48,7 @@ def draw(file: Path, out: Path, level: float = 0.9) -> list[Path]:
 
     Args:
         file: ``path.csv``.
-        out: folder that gets ``path.png`` and ``bands.png``; made where it is not there.
+        out: folder for ``path.png`` and ``bands.png``; made if it does not exist.
         level: probability of the bands and ellipses.
 
     Returns:

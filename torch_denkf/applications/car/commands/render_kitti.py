@@ -5,7 +5,7 @@
     denkf render-kitti --poses kitti/poses --out rendered        # along recorded poses
     denkf render-kitti --names a b c --frames 1000 --out town    # along invented ones
 
-A repeated or interrupted command goes on with the drives that are missing. See
+A repeated or interrupted command continues with the drives that are missing. See
 :func:`torch_denkf.applications.car.kitti.render.render_drives`, which does the work. From Python:
 
 >>> import tempfile

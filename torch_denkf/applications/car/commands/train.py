@@ -22,7 +22,7 @@ __all__ = ["Train"]
 
 @dataclass
 class Train(Command):
-    """Train a car's filter on recorded drives, rendered ones, or both; a repeated command goes on where it stopped."""
+    """Train a car's filter on recorded drives, rendered ones, or both; a repeated command resumes where it stopped."""
 
     out: Path  # folder of the filter, with everything that its training needs
     root: Path | None = None  # folder of recorded drives in KITTI's layout, with sequences/ and poses/
@@ -45,7 +45,7 @@ class Train(Command):
     example = "denkf train --rendered 20 --out runs/car"
 
     def run(self) -> None:
-        """Trains, and says how good the filter is."""
+        """Trains the filter, and prints its validation score."""
         if self.root is None and self.rendered < 3:
             raise ValueError("nothing to learn from: pass --root FOLDER, or --rendered N with three drives or more")
         import torch

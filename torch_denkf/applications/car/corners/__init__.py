@@ -1,1 +1,1 @@
-"""A drive as stereo corners and turn rates: its files, the motion that the corners show, its replay."""
+"""Drives as stereo corners and turn rates: files, motion between rows, replay."""

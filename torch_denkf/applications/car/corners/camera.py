@@ -1,4 +1,4 @@
-"""A stereo camera: where its corners lie in space, and where points appear in its images."""
+"""Stereo camera: triangulation of corners and projection of points."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ __all__ = ["StereoCamera"]
 class StereoCamera:
     """A rectified stereo camera. Its axes: x to the right, y down, z ahead, from the left lens.
 
-    A corner is (u left, v left, disparity) in pixels here, ``[*, 3]``. The rectification may have left a little. Below,
-    x and y are a corner's place from the centre, over the focal length, and r is the root of x^2 + y^2.
+    A corner is (u left, v left, disparity) in pixels, ``[*, 3]``. Residual errors of the rectification can be
+    corrected. Below, x and y are the normalised image coordinates of a corner, and r^2 = x^2 + y^2.
 
     Attributes:
         focal: focal length in pixels.
-        center: where the optical axis meets the images, (u, v) in pixels.
+        center: principal point (u, v) in pixels.
         baseline: distance of the lenses in m.
-        radial: an image's radius is too large by the factor ``1 + radial[0] + radial[1] r^2 + radial[2] r^4``.
-        disparity_offset: what disparities are short of, in pixels: what to multiply 1, x, y, x^2, xy, y^2 and r^4 with,
-            or the first of it.
+        radial: residual radial distortion, by the factor ``1 + radial[0] + radial[1] r^2 + radial[2] r^4``.
+        disparity_offset: correction of the disparity in pixels: coefficients of 1, x, y, x^2, xy, y^2 and r^4, or the
+            first of these.
 
     Raises:
-        ValueError: if a number is not finite, ``focal`` or ``baseline`` is not positive, or there are too many or few.
+        ValueError: if a number is not finite, ``focal`` or ``baseline`` is not positive, or a tuple has the wrong
+            length.
     """
 
     focal: float
@@ -49,7 +50,7 @@ class StereoCamera:
                 check_number(f"each number of {name}", number)
 
     def corners(self, pixels: Tensor) -> Tensor:
-        """Returns corners ``[*, 3]`` of what a tracker gives, ``[*, 4]``: u left, v left, u right, v right."""
+        """Returns corners ``[*, 3]`` of tracked pixels ``[*, 4]``: u left, v left, u right, v right."""
         left, right = self._undistorted(pixels[..., :2]), self._undistorted(pixels[..., 2:])
         x, y = ((pixels[..., :2] - torch.tensor(self.center).to(pixels)) / self.focal).unbind(-1)
         powers = [torch.ones_like(x), x, y, x.square(), x * y, y.square(), (x.square() + y.square()).square()]

@@ -27,22 +27,22 @@ ENTRIES: dict[str, tuple[tuple, str]] = {
     "rotational_velocity": ((3, "T"), "[3, T]"),
     "time_stamps": ((1, "T"), "[1, T]"),
 }
-MOST_BYTES = 1 << 31  # of a file, unpacked: ten minutes of a drive have 700 MB
-MOST_PIXELS = 1e5  # of a corner's place
-FASTEST = 40.0  # rad/s: gyros end at 35
+MOST_BYTES = 1 << 31  # size of an unpacked file: ten minutes of a drive have 700 MB
+MOST_PIXELS = 1e5  # bound of a corner's coordinates
+FASTEST = 40.0  # rad/s: gyroscopes measure up to 35
 
 
 def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[TensorDict, StereoCamera]:
-    """Returns rows of a drive: the corners that each row shares with the row before, and its turn rates.
+    """Returns rows of a drive: the corners that each row shares with the row before, and turn rates.
 
-    A row *repeats* the one before where all shared corners are in the same places to the bit: the tracker has found
-    new corners there and followed none. Such a row says nothing of the motion since the row before, and is not
-    observed. Standing still is not a repeat: then the corners tremble.
+    A row *repeats* the one before if all shared corners have exactly the same coordinates: the tracker has only
+    searched for new corners. Such a row has no information about the motion since the row before, and is not observed.
+    At standstill the coordinates differ by noise.
 
     Args:
-        file: npz with ``features`` ``[4, M, T]`` (u left, v left, u right, v right in pixels, -1 where a corner is not
+        file: npz with ``features`` ``[4, M, T]`` (u left, v left, u right, v right in pixels, -1 if a corner is not
             seen), ``K``, ``b``, ``cam_T_imu``, ``rotational_velocity`` ``[3, T]`` and ``time_stamps`` ``[1, T]``.
-        rows: how many to read; all by default.
+        rows: number of rows to read; all by default.
 
     Returns:
         The rows ``[T]`` in float64, and the camera:
@@ -50,14 +50,14 @@ def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[Tensor
         ===================== ============ =======================================================================
         key                   shape        content
         ===================== ============ =======================================================================
-        ``corners``           [T,N,2,4]    in the row before and in this one, pixels; zero where there are fewer
-        ``seen``              [T,N]        bool: which there are
-        ``came_from``         [T,N]        int64: where a corner stands in the row before; -1 for a new one
-        ``repeats``           [T,N]        int64: how many rows that repeat the one before a corner has been through
-        ``motion_observed``   [T,1]        bool: there are corners, and the row repeats none
+        ``corners``           [T,N,2,4]    in the row before and in this one, pixels; zero-padded
+        ``seen``              [T,N]        bool: mask of corners
+        ``came_from``         [T,N]        int64: index of the corner in the row before; -1 for a new one
+        ``repeats``           [T,N]        int64: number of repeated rows in the corner's track
+        ``motion_observed``   [T,1]        bool: there are corners, and the row is no repeat
         ``gyro``              [T,3]        rad/s about the camera's axes
         ``gyro_observed``     [T,1]        bool: True
-        ``dt``                [T,1]        s since the row before; the first row has the second one's
+        ``dt``                [T,1]        s since the row before; in the first row that of the second
         ``time``              [T,1]        s since the first row
         ``step``              [T,1]        int64
         ===================== ============ =======================================================================
@@ -65,8 +65,8 @@ def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[Tensor
     Raises:
         FileNotFoundError: if there is no such file.
         KeyError: if an entry is missing in it.
-        ValueError: if the file is damaged, or an entry is not of its shape, not finite, or no camera's, no rotation's
-            or no gyro's numbers; names the file and the entry.
+        ValueError: if the file is damaged, or an entry is not of its shape, not finite, or implausible for a camera,
+            rotation or gyroscope; the message names the file and the entry.
     """
     file = Path(file).expanduser()
     entries = _read_entries(file)
@@ -91,10 +91,10 @@ def read_corner_drive(file: str | Path, rows: int | None = None) -> tuple[Tensor
 
 
 def corner_replay(drives: dict[str, TensorDict], **options) -> EpisodeReplay:
-    """Drives as episodes of one data set, which :class:`~torch_denkf.envs.ReplayEnv` replays; nothing is for tests.
+    """Returns drives as episodes of one data set for :class:`~torch_denkf.envs.ReplayEnv`, without a test split.
 
     Args:
-        drives: rows ``[T]`` by the name of the drive, with what a filter is to read.
+        drives: rows ``[T]`` with the inputs of a filter, by the name of the drive.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Raises:
@@ -163,14 +163,14 @@ def _check_entries(file: Path, entries: dict[str, np.ndarray]) -> None:
 
 
 def _pairs(features: np.ndarray) -> dict[str, Tensor]:
-    """Returns corners of neighbouring rows with the keys of :func:`read_corner_drive`, and which rows are repeats."""
+    """Returns corners of neighbouring rows with the keys of :func:`read_corner_drive`, and the mask of repeats."""
     there = (features != -1).all(0)
     both = there[:, 1:] & there[:, :-1]
     most, count, tracks = max(int(both.sum(0).max()), 1), features.shape[-1], len(there)
     corners, seen = np.zeros((count, most, 2, 4)), np.zeros((count, most), bool)
     came_from, repeats = np.full((count, most), -1), np.zeros((count, most), int)
     again, survived = np.zeros(count, bool), np.zeros(tracks, int)
-    places = np.full(tracks, -1)  # of tracks in the row before
+    places = np.full(tracks, -1)  # index of each track in the row before
     for row in range(1, count):
         which = np.flatnonzero(both[:, row - 1])
         pair = features[:, which, row - 1 : row + 1].transpose(1, 2, 0)
@@ -179,7 +179,7 @@ def _pairs(features: np.ndarray) -> dict[str, Tensor]:
         survived[which] += again[row]
         came_from[row, : len(which)], repeats[row, : len(which)] = places[which], survived[which]
         places[:] = -1
-        if not again[row]:  # behind a repeat, a corner is another point of the world
+        if not again[row]:  # after a repeat, a track is another point of the world
             places[which] = np.arange(len(which))
     found = {"corners": corners, "seen": seen, "came_from": came_from, "repeats": repeats, "again": again}
     return {key: torch.as_tensor(value) for key, value in found.items()}

@@ -1,4 +1,4 @@
-"""The motion of a stereo camera between two rows, from the corners that both see, with its covariance."""
+"""Estimates a stereo camera's motion between two rows from shared corners, with its covariance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch_denkf.functional.manifolds import SE3, quaternion_of, rotate, rotatio
 __all__ = ["CornerMotion", "CornerNoise", "corner_motion", "corner_motions", "started_by_ransac"]
 
 
-LEAST = 0.03  # weight of a corner that is not wrong
+LEAST = 0.03  # smallest weight of an inlier
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class CornerNoise:
     """Standard deviations of corners, in pixels.
 
     Attributes:
-        pixel: of a corner's place in the left image, between two rows.
-        pixel_per_flow: what a pixel of flow between the rows adds to it.
-        disparity: of the disparity, in each row.
-        disparity_per_flow: what a pixel of flow adds to it.
-        stereo: of the disparity's error that stays with a corner: its right image shows not quite the same point.
-        stereo_per_offset: what a pixel of difference between the heights in both images adds to it.
-        stereo_per_disparity: what a pixel of disparity adds to it.
-        stereo_stale: what it is multiplied with where a corner has been through rows that repeat the one before.
-        stereo_walk: how much it changes from row to row.
-        freedom: degrees of freedom of Student's t, by which outliers count less.
+        pixel: tracking error in the left image, between two rows.
+        pixel_per_flow: additional tracking error per pixel of flow.
+        disparity: white error of the disparity, in each row.
+        disparity_per_flow: additional white error per pixel of flow.
+        stereo: constant disparity error of a corner, from a wrong stereo match.
+        stereo_per_offset: additional constant error per pixel of difference between the heights in both images.
+        stereo_per_disparity: additional constant error per pixel of disparity.
+        stereo_stale: factor on the constant error of corners from repeated rows.
+        stereo_walk: random walk of the constant error, per row.
+        freedom: degrees of freedom of Student's t, which down-weights outliers.
 
     Raises:
         ValueError: if a number is negative or not finite, or ``pixel``, ``disparity`` or ``freedom`` is zero.
@@ -59,12 +59,12 @@ class CornerNoise:
             check_number(each.name, getattr(self, each.name), least=0, above=above)
 
     def stereo_var(self, corners: Tensor, offset: Tensor, stale: Tensor) -> Tensor:
-        """Returns the variance of the error that stays with a corner, ``[*]`` in pixels^2, before it is observed.
+        """Returns the prior variance of a corner's constant disparity error, ``[*]`` in pixels^2.
 
         Args:
             corners: (u, v, disparity), ``[*, 3]``.
             offset: difference of each corner's heights in both images, ``[*]`` in pixels.
-            stale: ``[*]`` bool: which have been through a row that repeats the one before.
+            stale: ``[*]`` bool: corners from repeated rows.
         """
         var = self.stereo**2 + (self.stereo_per_disparity * corners[..., 2]).square()
         var = var + (self.stereo_per_offset * offset).square()
@@ -76,11 +76,11 @@ class CornerMotion(NamedTuple):
 
     Attributes:
         motion: points of SE3 ``[*B, 7]``: the pose of the later row, seen from the earlier one.
-        cov: of its tangent ``[*B, 6, 6]``, as the weights of the corners say.
-        log_likelihood: of the corners, mean over those that are seen, ``[*B]``.
-        weight: of each corner ``[*B, N]``, about 1 for sound ones, 0 where not seen.
-        stereo: the error of each corner's disparity that is the same in both rows, ``[*B, N]`` in pixels.
-        stereo_var: of it.
+        cov: covariance of its tangent ``[*B, 6, 6]``, from the weighted corners.
+        log_likelihood: mean log likelihood of the seen corners, ``[*B]``.
+        weight: weight of each corner ``[*B, N]``, about 1 for inliers, 0 for missing ones.
+        stereo: constant disparity error of each corner, ``[*B, N]`` in pixels.
+        stereo_var: variance of this error.
     """
 
     motion: Tensor
@@ -102,29 +102,29 @@ def corner_motion(
     start: Tensor | None = None,
     steps: int = 12,
 ) -> CornerMotion:
-    """Returns the most likely motion by Gauss-Newton, on the corners' places and disparities.
+    """Returns the most likely motion by Gauss-Newton on the corners' coordinates and disparities.
 
-    Each corner's place in space is known but for the noise of the earlier row. That noise goes through the motion into
-    what the later row should show, so that a far corner says much of the turn and little of the way. Students's t
-    weights a corner by what is left of it.
+    The position of each corner has the noise of the earlier row. The motion carries that noise into the prediction of
+    the later row, so that a far corner informs the rotation much and the translation little. Student's t weights each
+    corner by its residual.
 
     Args:
         before: corners (u, v, disparity) of the earlier row, ``[*B, N, 3]`` in pixels.
         after: the same corners in the later row.
-        seen: ``[*B, N]`` bool: which there are. Others may hold any finite number.
-        camera: of both rows.
-        noise: of the corners.
-        stereo_var: variance of the error of a corner's disparity that is the same in both rows, ``[*B, N]`` in
-            pixels^2; by default that of the noise, without what it has by offsets.
-        start: motions to start from, ``[*B, 7]``; by default none moved.
-        steps: of Gauss-Newton.
+        seen: ``[*B, N]`` bool: mask of valid corners.
+        camera: camera of both rows.
+        noise: noise of the corners.
+        stereo_var: variance of a corner's constant disparity error, ``[*B, N]`` in pixels^2; by default that of the
+            noise, without offsets.
+        start: initial motions, ``[*B, 7]``; by default no motion.
+        steps: steps of Gauss-Newton.
 
     Returns:
-        A :class:`CornerMotion`; where fewer than four corners are seen, the covariance means nothing. Corners that are
-        not finite, or have a disparity below half a pixel, count as not seen.
+        A :class:`CornerMotion`; with fewer than four corners the covariance is meaningless. Corners that are not
+        finite, or have a disparity below half a pixel, count as not seen.
 
     Raises:
-        ValueError: if the shapes do not go together, or ``seen`` is not boolean.
+        ValueError: if the shapes do not match, or ``seen`` is not boolean.
     """
     noise = CornerNoise() if noise is None else noise
     check_count("steps", steps, least=0)
@@ -135,7 +135,7 @@ def corner_motion(
     after = torch.where(seen.unsqueeze(-1), after, before)
     zero = torch.zeros_like(before[..., 2])
     stays = noise.stereo_var(before, zero, zero.bool()) if stereo_var is None else stereo_var
-    wrong = torch.zeros_like(stays)  # how much too small a disparity of the earlier row is
+    wrong = torch.zeros_like(stays)  # estimated error of the earlier disparity, pixels
     pose = SE3().neutral(before).expand(*before.shape[:-2], 7) if start is None else start
     ridge, own = 1e-6 * torch.eye(6).to(before), before.new_tensor([0.0, 0.0, 1.0])
     for step in range(steps + 1):
@@ -166,7 +166,7 @@ def corner_motion(
     constant = torch.lgamma((freedom + 3) / 2) - torch.lgamma(freedom / 2) - 1.5 * (freedom * math.pi).log()
     density = density + constant
     mean = torch.where(ahead, density, 0.0).sum(-1) / ahead.sum(-1).clamp_min(1)
-    gain = (stays.unsqueeze(-1) * (own - through)).unsqueeze(-2) @ inverse  # of the error that stays
+    gain = (stays.unsqueeze(-1) * (own - through)).unsqueeze(-2) @ inverse  # gain of the constant error
     error = (gain @ left.unsqueeze(-1))[..., 0, 0]
     var = stays - stays * (gain @ (own - through).unsqueeze(-1))[..., 0, 0]
     error, var = torch.where(ahead, error, 0.0), torch.where(ahead, var, stays)
@@ -195,21 +195,21 @@ def corner_motions(
     steps: int = 6,
     memory: bool = True,
 ) -> CornerMotion:
-    """Returns the motion of each row since the row before; what a corner has shown of its disparity is remembered.
+    """Returns the motion of each row since the row before, and tracks each corner's disparity error.
 
-    A corner that moves shows how far it is. So the error of its disparity, which stays with it, is known better from
+    The motion of a corner in the image informs its depth, so that its constant disparity error is estimated better from
     row to row.
 
     Args:
-        rows: of :func:`~torch_denkf.applications.car.corners.drive.read_corner_drive`, ``[*B, T]``.
-        camera: of the rows.
-        noise: of the corners.
-        start: motions to start from, ``[*B, T, 7]``; by default those of random samples of corners.
-        steps: of Gauss-Newton.
-        memory: False to take each row alone.
+        rows: rows of :func:`~torch_denkf.applications.car.corners.drive.read_corner_drive`, ``[*B, T]``.
+        camera: camera of the rows.
+        noise: noise of the corners.
+        start: initial motions, ``[*B, T, 7]``; by default from RANSAC.
+        steps: steps of Gauss-Newton.
+        memory: False to estimate each row independently.
 
     Returns:
-        Motions ``[*B, T]``; where ``"motion_observed"`` is False, they mean nothing.
+        Motions ``[*B, T]``; they are meaningless if ``"motion_observed"`` is False.
     """
     noise = CornerNoise() if noise is None else noise
     before, after = (camera.corners(rows["corners"][..., row, :]) for row in (0, 1))
@@ -233,7 +233,7 @@ def corner_motions(
         less = torch.stack([torch.zeros_like(mean), torch.zeros_like(mean), mean], -1)
         corners = before[..., row, :, :] - less, after[..., row, :, :] - less, there
         one = corner_motion(*corners, camera, noise, stereo_var=var, start=start[..., row, :], steps=steps)
-        sound = one.weight > LEAST  # the others tell nothing of their disparity
+        sound = one.weight > LEAST  # outliers have no information about their disparity
         mean, var = mean + torch.where(sound, one.stereo, 0.0), torch.where(sound, one.stereo_var / one.weight, var)
         found.append(one._replace(stereo=mean, stereo_var=var))
     return CornerMotion(*(torch.stack(entry, rows.ndim - 1) for entry in zip(*found, strict=True)))
@@ -243,10 +243,10 @@ def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, nois
     """Returns the covariance of the observations in the later row, ``[*, 3, 3]``.
 
     Args:
-        by_disparity: by how much it changes with the disparity of the earlier row, ``[*, 3]``.
+        by_disparity: derivative of the observation with respect to the earlier disparity, ``[*, 3]``.
         flow2: square of the flow ``[*]``.
-        stays: variance of the disparity's error that is the same in both rows, ``[*]``.
-        noise: of the corners.
+        stays: variance of the constant disparity error, ``[*]``.
+        noise: noise of the corners.
     """
     own = torch.tensor([0.0, 0.0, 1.0]).to(by_disparity)
     same = own - by_disparity
@@ -262,17 +262,17 @@ def _covariance(by_disparity: Tensor, flow2: Tensor, stays: Tensor | float, nois
 def started_by_ransac(
     before: Tensor, after: Tensor, seen: Tensor, camera: StereoCamera, *, pixels: float = 1.5
 ) -> tuple[Tensor, Tensor]:
-    """Motions of rows one by one, by OpenCV's random samples of corners.
+    """Returns motions of single rows by OpenCV's RANSAC.
 
     Args:
         before: corners of the earlier rows ``[T, N, 3]``.
-        after: of the later rows.
+        after: corners of the later rows.
         seen: ``[T, N]`` bool.
-        camera: of both rows.
-        pixels: how far off a corner may be.
+        camera: camera of both rows.
+        pixels: largest reprojection error of an inlier.
 
     Returns:
-        Points of SE3 ``[T, 7]``, that of no motion where none was found; and how many corners fit, ``[T]`` int64.
+        Points of SE3 ``[T, 7]``, the identity if none was found; and the number of inliers, ``[T]`` int64.
     """
     matrix = np.array([[camera.focal, 0, camera.center[0]], [0, camera.focal, camera.center[1]], [0, 0, 1.0]])
     poses = SE3().neutral(before).repeat(len(before), 1)

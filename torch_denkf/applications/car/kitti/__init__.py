@@ -1,1 +1,1 @@
-"""Drives in the layout of KITTI's odometry benchmark: read, rendered, mirrored, and as a data set."""
+"""Drives in the layout of KITTI's odometry benchmark: reader, renderer, mirror images, data set."""

@@ -1,26 +1,26 @@
-"""Recorded altitudes, made to agree with where the camera looks."""
+"""Correction of recorded altitudes that contradict the camera's attitude."""
 
 from __future__ import annotations
 
 import numpy as np
 
-TOLERANCE = 0.05  # largest difference of the slopes that altitude and attitude show: 2.9 degrees
-MOVING = 0.25  # m: steps from which the camera's tilt against the road is told
+TOLERANCE = 0.05  # largest difference of the slopes by altitude and by attitude: 2.9 degrees
+MOVING = 0.25  # m: shortest step for estimating the camera's tilt against the road
 
 
 def steady_altitude(poses: np.ndarray) -> np.ndarray:
-    """Takes out climbs that the camera's attitude does not show.
+    """Removes climbs that contradict the camera's attitude.
 
-    The altitude of recorded drives is that of a satellite receiver, which drifts while the car stands: at the start of
-    the odometry benchmark's drive 08 it climbs by two metres on one metre of the way, with a level camera. A road laid
-    under such poses is a wall. Here each step's climb follows, within a tolerance, the slope along which the camera
-    looks, plus the camera's tilt against the road, which is the median over the drive.
+    The altitude of recorded drives is from a satellite receiver, and drifts while the car stands: at the start of the
+    odometry benchmark's drive 08 it climbs two metres over one metre, with a level camera. A road under such poses
+    would be a wall. Here each step's climb is clamped to a tolerance around the slope of the camera's optical axis plus
+    the camera's tilt against the road, which is the median over the drive.
 
     Args:
         poses: camera-to-world matrices, ``[N, 3, 4]``, in m; y is down.
 
     Returns:
-        The same poses with other y; where no step is out of tolerance, the same to the last bit.
+        The poses with corrected y; unchanged if no step is out of tolerance.
     """
     step = np.diff(poses[:, :, 3], axis=0)
     way, climb = np.hypot(step[:, 0], step[:, 2]), step[:, 1]

@@ -1,4 +1,4 @@
-"""The times of a drive's frames, also where some of them are wrong: which are sound, and how far frames are apart."""
+"""Times of a drive's frames: masks invalid stamps, interpolates them, and computes the time steps."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from torch_denkf.data.times import MOST_WRONG, filled, sound
 
 __all__ = ["GAP", "Times", "read_times"]
 
-GAP = 1.5  # a step that is longer, in median steps, is a gap: no image pair reaches over it
-SHORTEST, LONGEST = 1e-3, 2.0  # s between frames: beyond, the times are not in seconds, or no flow can be seen
+GAP = 1.5  # median steps: a longer step is a gap, which no image pair crosses
+SHORTEST, LONGEST = (
+    1e-3,
+    2.0,
+)  # s between frames; other medians are errors of the unit, or too long for flow
 
 
 class Times(NamedTuple):
-    """When a drive's frames were taken.
+    """Times of a drive's frames.
 
     Attributes:
-        times: s, increasing, ``[N]``; where a stamp is wrong, a value between its neighbours.
-        dt: s since the frame before, ``[N]``: the median in all rows but those after a gap. The first row has the
-            median, too.
-        sound: whether the stamp of the file is right, bool ``[N]``.
+        times: s, increasing, ``[N]``; invalid stamps are interpolated.
+        dt: s since the frame before, ``[N]``: the median, except in rows after a gap.
+        sound: whether the stamp of the file is valid, bool ``[N]``.
         median: s, the frame time.
     """
 
@@ -36,16 +38,16 @@ class Times(NamedTuple):
 
 
 def read_times(file: Path, rows: int) -> Times:
-    """Reads the frames' times, or makes nominal ones if there is no file.
+    """Reads the frames' times, or returns nominal ones if there is no file.
 
     A warning counts the stamps that do not increase, which are not used, and the gaps.
 
     Args:
         file: ``sequences/NN/times.txt``.
-        rows: how many frames need a time.
+        rows: number of frames.
 
     Returns:
-        The times of the first ``rows`` frames. Their median is over all rows of the file, 0.103 s where there is none.
+        The times of the first ``rows`` frames. Their median is over all rows of the file, 0.103 s if there is none.
 
     Raises:
         ValueError: naming file and line, if the file has fewer rows, if a row is no finite number, if more than a
@@ -101,8 +103,8 @@ def _with_steps(file: Path, times: np.ndarray, good: np.ndarray, rows: int) -> T
             f"{file}: the median difference of its times is {median:g} s, expected {SHORTEST:g} to {LONGEST:g}; write "
             "the times in seconds"
         )
-    # Clocks jitter, and images come at a steady rate all the same: a step counts with its own length where that cannot
-    # be jitter.
+    # Stamps jitter, although the camera's rate is steady: a step keeps its length only if it is too long or short for
+    # jitter.
     own = np.concatenate([[median], steps])
     dt = np.where((own > GAP * median) | (own < median / GAP), own, median)
     dt[0] = median

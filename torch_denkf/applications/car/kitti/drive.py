@@ -35,14 +35,14 @@ from torch_denkf.data.pictures import check_size, decode_picture, scaled, text_o
 __all__ = ["list_kitti_drives", "read_kitti_drive"]
 
 CAMERAS = ("image_2", "image_0", "image_3", "image_1")
-_FORMAT = 3  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 3  # part of the cache's key: raise it when the stored content changes
 
 
 def list_kitti_drives(root: str | Path) -> list[str]:
-    """Names of the sequences that have both images and poses.
+    """Returns names of the sequences that have both images and poses.
 
     Args:
-        root: folder that holds ``sequences`` and ``poses``.
+        root: folder with ``sequences`` and ``poses``.
 
     Returns:
         Names to pass to :func:`read_kitti_drive`, sorted.
@@ -73,15 +73,15 @@ def read_kitti_drive(
 ) -> TensorDict:
     """Reads one drive: images of one size, and the planar state in Kloss et al.'s convention.
 
-    Row k is frame ``first + k``, from the first to the last frame that has both an image and a pose. Frames that lack
-    an image, or whose file is damaged (a warning names it), keep their row. So do frames whose time does not increase,
-    which count as missing; a warning counts them, as it does gaps.
+    Row k is frame ``first + k``, from the first to the last frame that has both an image and a pose. Frames without an
+    image, or with a damaged file (a warning names it), keep their row. Frames whose time does not increase keep their
+    row, too, and count as missing; warnings count them and the gaps.
 
     ================= ========== ================================================================================
     key               shape      content
     ================= ========== ================================================================================
-    ``image``         [N,C,H,W]  uint8, RGB or grey; zeros where the frame is missing
-    ``frame_valid``   [N,1]      bool: there is an image, of a time that is right
+    ``image``         [N,C,H,W]  uint8, RGB or grey; zeros if the frame is missing
+    ``frame_valid``   [N,1]      bool: there is an image with a valid time
     ``state``         [N,5]      float32: x m (forward at frame 0), y m (left), θ rad (to the left, unwrapped),
                                  v m/s, θ_dot rad/s
     ``time``          [N,1]      float64, s
@@ -91,35 +91,34 @@ def read_kitti_drive(
     ``calibration``   [N,4]      float32: fx, fy, cx, cy in pixels of ``size``, the same in all rows
     ================= ========== ================================================================================
 
-    v and θ_dot of row t are **backward** differences, the motion from frame t-1 to t: the image pair (t-1, t) shows
-    exactly them. The first pose of the file has none and takes that of the next. v is signed: negative in reverse.
-    After a gap both are means over it, and no image pair reaches over it.
+    v and θ_dot of row t are **backward** differences, the motion from frame t-1 to t, as the image pair (t-1, t) shows
+    it. The first pose of the file has the velocities of the next. v is signed: negative in reverse. After a gap both
+    are means over the gap, which no image pair crosses.
 
-    Reading a drive again decodes each image; the result is kept as a memory-mapped TensorDict, whose key covers the
-    folder, the options, and the names, times and sizes of all files read. Old entries may be deleted at any time.
+    The decoded drive is cached as a memory-mapped TensorDict, whose key covers the folder, the options, and the names,
+    times and sizes of all files. Old entries may be deleted at any time.
 
     Args:
-        root: folder that holds ``sequences`` and ``poses``.
+        root: folder with ``sequences`` and ``poses``.
         sequence: name of the sequence, such as ``"09"`` or 9.
         camera: folder of the images; by default the first of ``image_2``, ``image_0``, ``image_3`` and ``image_1``
             that has any.
         size: (H, W) to scale the images to.
-        colour: True gives three channels, where grey images are repeated so that one network takes both; False gives
-            one grey channel; None leaves them as the files are.
+        colour: True gives three channels, in which grey images are repeated so that one network takes both; False gives
+            one grey channel; None keeps the channels of the files.
         cache: folder of the cache; True for ``$TORCH_DENKF_CACHE`` or else ``~/.cache/torch_denkf``; None or False
             for none: the drive is then in memory.
-        progress: called with the number of images that were decoded since the last call; never, where the cache has
-            the drive.
+        progress: called with the number of images that were decoded since the last call; never for a cached drive.
 
     Returns:
         The drive, batch size ``[N]``.
 
     Raises:
         FileNotFoundError: without the sequence's folder, images, poses or calibration.
-        ValueError: for malformed rows, matrices that are no rotations, positions that leap, focal lengths that are not
-            positive, times more than a tenth of which do not increase or that are not in seconds, images of other
-            names, images without any pose, drives none of whose images can be read, drives whose images differ in size,
-            and sizes that are not positive.
+        ValueError: for malformed rows, matrices that are no rotations, jumps of the position, focal lengths that are
+            not positive, times that are not in seconds or of which more than a tenth do not increase, images with other
+            names or without any pose, drives without a readable image or with images of different sizes, and sizes that
+            are not positive.
         OSError: if the cache cannot be written.
 
     Examples:
@@ -162,7 +161,7 @@ def read_kitti_drive(
 
 
 def choose_camera(folder: Path, camera: str | None) -> str:
-    """Returns the name of the folder of a drive's images: the one that is asked for, or the first that there is."""
+    """Returns the name of a drive's image folder: the requested one, or the first that has images."""
     if not folder.is_dir():
         names = sorted(e.name for e in folder.parent.iterdir() if e.is_dir()) if folder.parent.is_dir() else []
         raise FileNotFoundError(
@@ -246,7 +245,7 @@ def _read(
                 if clock.sound[number]:
                     image[number - first], valid[number - first] = pixels, True
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # without it, thousands of images would still be decoded
+            pool.shutdown(wait=False, cancel_futures=True)  # otherwise thousands of images would still be decoded
             raise
     if native is None:
         raise ValueError(f"none of the {len(numbers)} images in {folder / camera} can be read; download them again")
@@ -266,7 +265,7 @@ def _read(
 
 
 def _decode(file: Path, flags: int) -> np.ndarray | None:
-    return decode_picture(file.read_bytes(), flags) if file.is_file() else None  # or a folder, or a link to nowhere
+    return decode_picture(file.read_bytes(), flags) if file.is_file() else None  # None for a folder or a broken link
 
 
 def _is_colour(files) -> bool:

@@ -1,4 +1,4 @@
-"""Replays a recorded drive as an environment: what a robot on that drive would have seen, frame by frame."""
+"""Replays a recorded drive as an environment, frame by frame."""
 
 from __future__ import annotations
 
@@ -21,53 +21,51 @@ __all__ = ["KITTIReplayEnv"]
 class KITTIReplayEnv(RowsEnv):
     """Replays sub-sequences of one KITTI drive, one for each element of the batch, in lockstep.
 
-    Emits, at reset and at each step, the row t of the drive exactly as
-    :func:`torch_denkf.applications.car.kitti.frames.drive_frames` has it:
+    At reset and at each step it returns row t of :func:`torch_denkf.applications.car.kitti.frames.drive_frames`:
 
     ============ ================ ====================================================================================
     key          shape            content
     ============ ================ ====================================================================================
     ``pixels``   ``[*B,2C,H,W]``  float32: frame t in [0, 1], then the difference of frames t and t-1; C = 3 in colour;
-                                  where the drive has images
-    ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.applications.car.with_motion`
-    ``road``     ``[*B,p,s]``     float32, where the drive has it
-    ``observed`` ``[*B,1]``       bool: frames t and t-1 are both there; what is missing is zero in the pixels
-    ``steps``    ``[*B,1]``       int64, where the drive has it: see ``kitti.gaps.bridge_gaps``
-    ``state``    ``[*B,5]``       float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)
+                                  if the drive has images
+    ``flow``     ``[*B,3,h,w]``   float32, if the drive has it: see :func:`torch_denkf.applications.car.with_motion`
+    ``road``     ``[*B,p,s]``     float32, if the drive has it
+    ``observed`` ``[*B,1]``       bool: frames t and t-1 both exist; missing pixels are zero
+    ``steps``    ``[*B,1]``       int64, if the drive has it: see ``kitti.gaps.bridge_gaps``
+    ``state``    ``[*B,5]``       float32, ground truth: x m, y m, θ rad, v m/s, θ_dot rad/s (backward differences)
     ``is_init``  ``[*B,1]``       bool: an episode starts here
-    ``time``     ``[*B,1]``       float64, s, as the drive counts it
+    ``time``     ``[*B,1]``       float64, s, time of the drive
     ============ ================ ====================================================================================
 
-    An episode shows ``length`` frames, the one at reset included: ``length - 1`` steps, then it is truncated. Rows may
-    end at different steps; a reset restarts only the rows that ``"_reset"`` marks. The difference at reset is that
-    to the frame before, where there is one. Rewards are zero.
+    An episode has ``length`` frames, including the one at reset: it is truncated after ``length - 1`` steps. Rows may
+    end at different steps; a reset restarts only the rows that ``"_reset"`` marks. The difference at reset is to the
+    frame before, if there is one. Rewards are zero.
 
     A replay has no actions. TorchRL's batched environments and rollouts work with an empty action spec, but its
     collectors (0.14) do not, so the ``"action"`` here has **width zero**: rollouts without policy, SerialEnv,
     ParallelEnv and Collector with ``policy=None`` work as they are. A policy need not write it, except in a Collector
-    over a ParallelEnv, which wants all input keys from the policy: put the filter in a transform there.
+    over a ParallelEnv, which requires all input keys from the policy: put the filter in a transform there.
 
     Args:
-        drive: the folder that holds ``sequences`` and ``poses``, or a drive as
-            :func:`torch_denkf.applications.car.read_kitti_drive` or :func:`torch_denkf.applications.car.with_motion`
-            gives it.
+        drive: folder with ``sequences`` and ``poses``, or a drive from
+            :func:`torch_denkf.applications.car.read_kitti_drive` or :func:`torch_denkf.applications.car.with_motion`.
         sequence: name of the sequence, if ``drive`` is a folder.
         batch_size: ``*B``.
-        start: row of the drive at which episodes start: one, one for each element of the batch (any shape that expands
-            to ``*B``), or ``"random"``: drawn at each reset, uniformly over those from which ``length`` frames fit.
-        length: frames of an episode, at least 2: one, or one for each element; by default up to the drive's end.
+        start: row of the drive at which episodes start: a number, a tensor that expands to ``*B``, or ``"random"``:
+            drawn at each reset, uniformly among the rows with ``length`` frames left.
+        length: frames of an episode, at least 2: a number, or one for each element; by default up to the drive's end.
         size: (H, W) of the frames, if ``drive`` is a folder; likewise ``camera``, ``colour`` and ``cache``, see
             :func:`torch_denkf.applications.car.read_kitti_drive`.
         camera: folder of the images.
-        colour: True for three channels, False for a grey one, None for what the files have.
-        cache: where the decoded drive is kept.
-        seed: of the random starts; by default drawn from torch's generator. ``set_seed`` sets it again, and gives each
-            worker of a ParallelEnv its own.
-        device: of all that is emitted; the whole drive is moved there. By default where the drive is.
+        colour: True for three channels, False for a grey one, None for the channels of the files.
+        cache: folder of the decoded drive.
+        seed: seed of the random starts; by default drawn from torch's generator. ``set_seed`` sets it again, and gives
+            each worker of a ParallelEnv its own.
+        device: device of all outputs; the whole drive is moved there. By default the drive's.
 
     Raises:
         TypeError: if ``sequence`` is missing for a folder, or given for a drive.
-        ValueError: if an episode does not fit in the drive, or random starts come without ``length``.
+        ValueError: if an episode does not fit in the drive, or random starts are used without ``length``.
 
     Examples:
         >>> from torch_denkf.applications.car.kitti.render import write_drives

@@ -1,4 +1,4 @@
-"""Episodes of a KITTI data set: one for each drive and camera, and opening them."""
+"""Finds and reads the episodes of a KITTI data set: one for each drive and camera."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ PAIRS = (("image_2", "image_3"), ("image_0", "image_1"))
 
 @dataclass(frozen=True)
 class KITTIEpisode(Episode):
-    """One drive as one camera saw it, or its mirror image.
+    """Drive of one camera, or its mirror image.
 
     Attributes:
         drive: name of the sequence.
         camera: folder of the images.
-        mirrored: whether left and right are exchanged.
+        mirrored: whether left and right are swapped.
     """
 
     drive: str
@@ -33,16 +33,16 @@ class KITTIEpisode(Episode):
 
     @property
     def split_name(self) -> str:
-        """Returns the drive: its cameras and mirror images are on the same side of a split."""
+        """Returns the drive: its cameras and mirror images are in the same split."""
         return self.drive
 
 
 def find_drives(root: Path, drives: Sequence[str | int] | str | int | None) -> list[str]:
-    """Names of the drives to read, in the order asked for; all that have images and poses by default.
+    """Returns the names of the drives to read, in the requested order; by default all with images and poses.
 
     Raises:
-        FileNotFoundError: if there is none, saying what the drives below ``root`` lack.
-        ValueError: if none or one twice is asked for.
+        FileNotFoundError: if there is none; the message lists the missing files.
+        ValueError: if the list of drives is empty or has duplicates.
     """
     found = list_kitti_drives(root)
     if drives is None:
@@ -74,7 +74,7 @@ def _what_is_there(root: Path) -> str:
 
 
 def find_cameras(root: Path, drive: str, cameras: str | Sequence[str]) -> list[str | None]:
-    """Cameras of one drive to read; None stands for the first that has images.
+    """Returns the cameras of one drive to read; None stands for the first that has images.
 
     Raises:
         ValueError: if ``cameras`` is neither ``"first"``, ``"both"`` nor a sequence of folder names.
@@ -84,7 +84,7 @@ def find_cameras(root: Path, drive: str, cameras: str | Sequence[str]) -> list[s
             there: list[str | None] = [camera for camera in pair if _frame_files(root / "sequences" / drive / camera)]
             if there:
                 return there
-        return [None]  # the reader says what is missing
+        return [None]  # the reader raises for missing images
     if cameras == "first":
         return [None]
     if isinstance(cameras, str) or not cameras or len(set(cameras)) < len(cameras):
@@ -104,11 +104,11 @@ def read_drives(
     flow: bool | Callable[[TensorDictBase], TensorDictBase],
     progress: bool,
 ) -> list[TensorDict]:
-    """Reads drives one after another, with flow if asked for: True is :func:`with_motion`, with the same cache.
+    """Reads drives, and adds optical flow if requested: True stands for :func:`with_motion` with the same cache.
 
     Raises:
-        ValueError: if ``flow`` returns something else than the drive with ``"flow"``, or if drives differ in what a
-            frame holds.
+        ValueError: if ``flow`` does not return the drive with ``"flow"``, or if drives differ in the entries of a
+            frame.
     """
     counts = [len(_frame_files(root / "sequences" / drive / camera)) for drive, camera in sources]
     if not isinstance(flow, bool) and not callable(flow):
@@ -121,7 +121,7 @@ def read_drives(
             drive = read_kitti_drive(
                 root, name, camera=camera, size=size, colour=colour, cache=cache, progress=bar.update
             )
-            bar.update(ends + count - bar.n)  # what came from the cache
+            bar.update(ends + count - bar.n)  # images from the cache
             if add_flow:
                 rows = drive.batch_size
                 drive = add_flow(drive)

@@ -14,10 +14,10 @@ import numpy as np
 from torch_denkf.data.text import read_lines, read_number
 from torch_denkf.deployment.files import replacing
 
-FARTHEST = 1e6  # m from the origin: float32, which states are in, then still tells 6 cm apart
+FARTHEST = 1e6  # m from the origin: float32, the dtype of states, then resolves 6 cm
 LONGEST_FOCAL = 1e6  # pixels: a view of a minute of arc
-ROTATION = 0.01  # how far R R^T may be from I: files of two digits pass
-FASTEST = 300.0  # m/s: no robot that takes pictures of its road is faster
+ROTATION = 0.01  # largest deviation of R R^T from I; files with two digits pass
+FASTEST = 300.0  # m/s: beyond any car
 
 
 def read_poses(file: Path) -> np.ndarray:
@@ -31,8 +31,8 @@ def read_poses(file: Path) -> np.ndarray:
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: naming file and line, where a row is not twelve finite numbers, its first three columns are no
-            rotation, or its position is farther than 1000 km from the origin.
+        ValueError: if a row is not twelve finite numbers, its first three columns are no rotation, or its position is
+            farther than 1000 km from the origin; the message names file and line.
     """
     if not file.is_file():
         raise FileNotFoundError(
@@ -80,15 +80,15 @@ def _check_poses(file: Path, poses: np.ndarray) -> None:
 
 
 def check_speeds(file: Path, poses: np.ndarray, dt: np.ndarray) -> None:
-    """Raises for poses that no robot goes through.
+    """Checks that no two successive poses imply an impossible speed.
 
     Args:
-        file: that they are from.
+        file: file of the poses, for the message.
         poses: ``[N, 3, 4]``, of its first rows.
-        dt: s between each two of them, ``[N - 1]``.
+        dt: s between successive poses, ``[N - 1]``.
 
     Raises:
-        ValueError: naming file and line, if one is farther from the one before than 300 m/s allow.
+        ValueError: if a speed exceeds 300 m/s; the message names file and line.
     """
     ways = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
     wrong = np.flatnonzero(ways > FASTEST * dt)
@@ -130,8 +130,8 @@ def read_calibration(file: Path, camera: str) -> np.ndarray:
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: where the camera's row is missing, there twice or malformed, a focal length is not positive, or no
-            camera has such numbers.
+        ValueError: if the camera's row is missing, duplicated or malformed, a focal length is not positive, or the
+            numbers are impossible for a camera.
     """
     if not file.is_file():
         raise FileNotFoundError(f"no calibration at {file}; expected rows 'P0: ...' to 'P3: ...' of 12 numbers")

@@ -13,7 +13,7 @@ from torch_denkf.applications.car.kitti.gaps import steps_at
 
 __all__ = ["drive_frames", "frames_at", "mark_start"]
 
-MOTION_KEYS = ("flow", "road", "two_view")  # what with_motion adds
+MOTION_KEYS = ("flow", "road", "two_view")  # entries of with_motion
 
 
 def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
@@ -23,31 +23,31 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
     key          shape            content
     ============ ================ ====================================================================================
     ``pixels``   ``[*B,2C,H,W]``  float32: the frame t in [0, 1], then the difference of frames t and t-1 in [-1, 1];
-                                  where the drive has ``image``
-    ``flow``     ``[*B,3,h,w]``   float32, where the drive has it: see :func:`torch_denkf.applications.car.with_motion`
-    ``road``     ``[*B,p,s]``     float32, where the drive has it
-    ``two_view`` ``[*B,8]``       float32, where the drive has it
+                                  if the drive has ``image``
+    ``flow``     ``[*B,3,h,w]``   float32, if the drive has it: see :func:`torch_denkf.applications.car.with_motion`
+    ``road``     ``[*B,p,s]``     float32, if the drive has it
+    ``two_view`` ``[*B,8]``       float32, if the drive has it
     ``state``    ``[*B,5]``       float32, see :func:`torch_denkf.applications.car.read_kitti_drive`
-    ``observed`` ``[*B,1]``       bool: both frames are there, so that the difference means something
-    ``steps``    ``[*B,1]``       int64, where the drive has it: steps between the two frames, which then need not be
+    ``observed`` ``[*B,1]``       bool: both frames exist, so that the difference is valid
+    ``steps``    ``[*B,1]``       int64, if the drive has it: steps between the two frames, which then need not be
                                   neighbours, see ``kitti.gaps.bridge_gaps``
     ``time``     ``[*B,1]``       float64, s
     ============ ================ ====================================================================================
 
-    What is missing is zero: both parts of the pixels where frame t is, the difference, the flow and the road where
-    frame t-1 is. The first row of a drive has no frame before it and is not observed.
+    Missing values are zero: all pixels if frame t is missing; the difference, the flow and the road if frame t-1 is
+    missing. The first row of a drive has no frame before it and is not observed.
 
     Args:
-        drive: as :func:`torch_denkf.applications.car.read_kitti_drive` or
-            :func:`torch_denkf.applications.car.with_motion` gives it, batch size ``[N]``. One that has flow need not
-            have images.
+        drive: drive from :func:`torch_denkf.applications.car.read_kitti_drive` or
+            :func:`torch_denkf.applications.car.with_motion`, batch size ``[N]``. A drive with flow need not have
+            images.
         index: rows, int64 ``[*B]``, in [0, N).
 
     Returns:
         The frames, batch size ``*B``, on the drive's device.
 
     Raises:
-        KeyError: if ``drive`` lacks a key, with what to pass.
+        KeyError: if ``drive`` lacks a key.
     """
     missing = {"frame_valid", "state", "time"} - set(drive.keys())
     if not {"image", "flow"} & set(drive.keys()):
@@ -75,15 +75,15 @@ def frames_at(drive: TensorDictBase, index: Tensor) -> TensorDict:
 
 
 def drive_frames(drive: TensorDictBase) -> TensorDict:
-    """Returns all frames of a drive as training data: what a replay from its first row emits.
+    """Returns all frames of a drive as training data, equal to a replay from its first row.
 
     Args:
-        drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``.
+        drive: drive from :func:`torch_denkf.applications.car.read_kitti_drive`, batch size ``[N]``.
 
     Returns:
         The entries of :func:`frames_at` and ``"is_init"`` ``[N, 1]``, True in row 0; batch size ``[N]``. Pixels are
-        float32, four times the bytes of each channel's two uint8 frames: 180 kB a frame of 50 x 150 in colour. For
-        long drives take :func:`frames_at` with the rows of the windows instead.
+        float32, four times the bytes of each channel's two uint8 frames: 180 kB a frame of 50 x 150 in colour. For long
+        drives call :func:`frames_at` with the rows of each window instead.
     """
     rows = drive.batch_size[0]
     frames = frames_at(drive, torch.arange(rows, device=drive["state"].device))

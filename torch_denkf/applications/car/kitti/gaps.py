@@ -1,4 +1,4 @@
-"""Gaps in a drive: where frames are missing, a frame can be compared with the last one that is there."""
+"""Missing frames in a drive: pairs each frame with the last existing one."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ __all__ = ["bridge_gaps", "steps_between"]
 
 
 def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
-    """Pairs each frame with the last one before it that is there, so that a gap hides no motion.
+    """Pairs each frame with the last existing one before it, so that a gap loses no motion.
 
-    Without it a missing frame blinds two pairs of neighbours. What comes after,
+    Otherwise each missing frame makes two pairs of neighbours unobserved. Afterwards
     :func:`torch_denkf.applications.car.kitti.frames.frames_at`, :func:`torch_denkf.applications.car.with_motion` and
-    :class:`torch_denkf.applications.car.KITTIReplayEnv`, then takes differences and optical flow over those pairs; a
-    filter that knows what they mean has a :class:`torch_denkf.applications.car.modules.pairs.PairObservation`.
+    :class:`torch_denkf.applications.car.KITTIReplayEnv` compute differences and optical flow over these pairs; the
+    filter needs a :class:`torch_denkf.applications.car.modules.pairs.PairObservation`.
 
     Args:
-        drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``.
-        longest: steps between the frames of a pair, at most; 1 pairs neighbours only.
+        drive: drive from :func:`torch_denkf.applications.car.read_kitti_drive`, batch size ``[N]``.
+        longest: largest number of steps between the frames of a pair; 1 pairs neighbours only.
 
     Returns:
-        A shallow copy of the drive with ``"steps"`` ``[N, 1]``, int64: how many steps before this frame its pair
-        begins; 0 where the frame is missing, or none is there before it within reach.
+        A shallow copy of the drive with ``"steps"`` ``[N, 1]``, int64: steps back to the first frame of the pair; 0 if
+        this frame is missing, or there is none within ``longest`` steps.
 
     Raises:
         TypeError: if ``longest`` is no whole number.
         ValueError: if it is not positive.
 
-    No pair reaches over a gap in the drive's times, which shows in its ``"dt"``.
+    No pair crosses a gap in the drive's times (see ``"dt"``).
 
     Examples:
         >>> drive = TensorDict({"frame_valid": torch.tensor([1, 1, 0, 0, 1, 1, 0, 0, 0, 1]).bool().unsqueeze(-1)}, [10])
@@ -43,14 +43,14 @@ def bridge_gaps(drive: TensorDictBase, longest: int = 3) -> TensorDict:
     steps = steps_between(drive["frame_valid"].squeeze(-1), longest)
     after = after_gap(drive)
     if after is not None:
-        begun = after.cumsum(0)  # the stretch of each row; a pair lies in one
+        begun = after.cumsum(0)  # segment number of each row; a pair lies within a segment
         row = torch.arange(len(begun), device=begun.device)
         steps = torch.where(begun[row - steps] == begun, steps, 0)
     return drive.copy().set("steps", steps.unsqueeze(-1))
 
 
 def after_gap(drive: TensorDictBase) -> Tensor | None:
-    """Masks rows that come after a gap in time, bool ``[N]``; ``None`` where there is none."""
+    """Masks rows that come after a gap in time, bool ``[N]``; ``None`` if there is none."""
     dt = drive.get("dt", None)
     if dt is None or not dt.numel():
         return None
@@ -59,15 +59,15 @@ def after_gap(drive: TensorDictBase) -> Tensor | None:
 
 
 def steps_between(valid: Tensor, longest: int) -> Tensor:
-    """Steps from each frame back to the last one that is there, int64 ``[*B, N]``: see :func:`bridge_gaps`.
+    """Returns steps from each frame back to the last existing one, int64 ``[*B, N]``: see :func:`bridge_gaps`.
 
     Args:
-        valid: whether a frame is there, bool ``[*B, N]``, time last.
+        valid: mask of existing frames, bool ``[*B, N]``, time last.
         longest: as in :func:`bridge_gaps`.
     """
     row = torch.arange(valid.shape[-1], device=valid.device)
     never = -longest - 1
-    last = torch.where(valid, row, never).cummax(-1).values  # the last frame that is there, this one included
+    last = torch.where(valid, row, never).cummax(-1).values  # the last existing frame, including this one
     steps = row - torch.cat([torch.full_like(last[..., :1], never), last[..., :-1]], -1)
     return torch.where(valid & (steps <= longest), steps, 0)
 
@@ -75,7 +75,7 @@ def steps_between(valid: Tensor, longest: int) -> Tensor:
 def steps_at(drive: TensorDictBase, index: Tensor) -> Tensor:
     """Returns the number of steps between a frame and the first frame of its pair, ``[*B, 1]``; 0 for none.
 
-    Without :func:`bridge_gaps` a pair is of neighbours.
+    Without :func:`bridge_gaps`, pairs are neighbours.
     """
     if "steps" in drive:
         return drive["steps"][index]

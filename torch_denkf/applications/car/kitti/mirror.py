@@ -1,4 +1,4 @@
-"""Mirrored drives: what the camera would have seen, had left and right been exchanged."""
+"""Mirrors drives: swaps left and right."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from tensordict import TensorDict, TensorDictBase
 __all__ = ["mirror_drive"]
 
 _STATE_SIGNS = (1.0, -1.0, -1.0, 1.0, -1.0)  # x, y, θ, v, θ_dot
-_TWO_VIEW_SIGNS = (-1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0)  # left, up, around; right, down; what has no side
+_TWO_VIEW_SIGNS = (-1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0)  # left, up, around; right, down; symmetric entries
 
 
 def mirror_drive(drive: TensorDictBase, *, width: int | None = None) -> TensorDict:
-    """Mirrors a drive: images are flipped, and what points to the left points to the right.
+    """Mirrors a drive: flips images, and left and right of all entries.
 
-    A drive and its mirrored copy are two drives that might have been recorded; training on both doubles the data and
-    leaves no preference for one side (Kloss, Martius & Bohg 2021, arXiv:2012.14313, do so on KITTI).
+    Training on drives and their mirror images doubles the data and removes a bias to one side (as Kloss, Martius & Bohg
+    2021, arXiv:2012.14313, on KITTI).
 
     ==================== ==========================================================================================
     key                  change
@@ -26,16 +26,15 @@ def mirror_drive(drive: TensorDictBase, *, width: int | None = None) -> TensorDi
     ``calibration``      cx becomes ``width - 1 - cx``, as pixel centres are at whole numbers
     ==================== ==========================================================================================
 
-    All else stays as it is, ``road`` too: it compares what lies straight ahead.
+    All other entries are unchanged, also ``road``, which is the correlation straight ahead.
 
     Args:
-        drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, or rows of
-            :func:`torch_denkf.applications.car.kitti.frames.frames_at`; any batch size. Keys that are not there are
-            left out.
-        width: of the images in pixels, for the calibration; by default that of ``image`` or ``pixels``.
+        drive: drive from :func:`torch_denkf.applications.car.read_kitti_drive`, or rows of
+            :func:`torch_denkf.applications.car.kitti.frames.frames_at`; any batch size. All keys are optional.
+        width: width of the images in pixels, for the calibration; by default that of ``image`` or ``pixels``.
 
     Returns:
-        A shallow copy: entries that change are new, the others are shared.
+        A shallow copy: changed entries are new, the others are shared.
 
     Raises:
         ValueError: if the state does not have five columns, or if there is a calibration without images and

@@ -19,7 +19,7 @@ from torch_denkf.data.cache import cache_folder, cached
 
 __all__ = ["with_motion"]
 
-_FORMAT = 2  # part of the cache's key: raise it when what is stored changes
+_FORMAT = 2  # part of the cache's key: raise it when the stored content changes
 
 
 def with_motion(
@@ -32,7 +32,7 @@ def with_motion(
     signs: bool = False,
     repair: bool = False,
 ) -> TensorDict:
-    """Adds what the flow sensor reads to a drive: the motion of each image since the one before.
+    """Adds the inputs of the flow sensor to a drive: the motion of each image since the one before.
 
     ========= =============== =========================================================================================
     key       shape           content
@@ -45,20 +45,20 @@ def with_motion(
     With ``two_view`` also ``"two_view"`` ``[N, 8]``, float32: see
     :func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`.
 
-    All are zero in rows whose image, or the one before, is missing; after
-    ``kitti.gaps.bridge_gaps`` the one before is the last that is there. They cost 9 ms a frame at 50 x 150 pixels and
-    25 ms at 125 x 414 and are kept in the cache, under a key made of the images themselves.
+    All are zero in rows whose image, or the one before, is missing; after ``kitti.gaps.bridge_gaps`` the one before is
+    the last existing one. They cost 9 ms per frame at 50 x 150 pixels and 25 ms at 125 x 414, and are cached under a
+    hash of the images.
 
     Args:
-        drive: as :func:`torch_denkf.applications.car.read_kitti_drive` gives it, batch size ``[N]``; colour images are
-            reduced to grey.
-        height: of the camera over the road, in m.
+        drive: drive from :func:`torch_denkf.applications.car.read_kitti_drive`, batch size ``[N]``; colour images are
+            converted to grey.
+        height: height of the camera over the road, in m.
         cache: as in :func:`torch_denkf.applications.car.read_kitti_drive`.
-        keep_images: False leaves the images out of the result, which makes it light.
-        two_view: also track corners, for a sensor that reads them; 12 ms a frame at 125 x 414 pixels.
-        signs: whether the images' signs of a failing camera are added.
-        repair: whether the flow is continued over what stands still before the moving camera, see
-            ``vision.signs.static_region``: dirt, or a box.
+        keep_images: False leaves the images out of the result, which saves memory.
+        two_view: also track corners, for a sensor that reads them; 12 ms per frame at 125 x 414 pixels.
+        signs: whether to add the images' signs of a failing camera.
+        repair: whether to extrapolate the flow over static occlusions, such as dirt or a box, see
+            ``vision.signs.static_region``.
 
     Returns:
         A shallow copy of the drive, with these entries.

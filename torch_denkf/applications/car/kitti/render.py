@@ -1,7 +1,6 @@
 """Rendered drives in KITTI's layout: data that comes with the library, for tests, examples and first experiments.
 
-A car drives between houses, trees and parked cars, along a random road or along the poses of a recorded drive. What
-moves in the images moves as the recorded motion says.
+A car drives between houses, trees and parked cars, along a random road or along the poses of a recorded drive.
 :mod:`torch_denkf.applications.car.street.renderer` draws; ``denkf render-kitti`` is the command.
 """
 
@@ -26,7 +25,7 @@ from torch_denkf.applications.car.vision.poses import state_to_poses
 
 __all__ = ["random_drive", "render_drives", "roadside_scene", "write_drives"]
 
-FRAMES = 300  # of an invented drive
+FRAMES = 300  # length of a random drive
 GREY_OR_COLOUR = ("image_2", "image_0")
 
 
@@ -45,27 +44,27 @@ def render_drives(
     overwrite: bool = False,
     progress: Callable[[int], object] | None = None,
 ) -> list[str]:
-    """Renders drives along recorded or invented poses, with hills and moving cars, in KITTI's layout.
+    """Renders drives along recorded or random poses, with hills and moving cars, in KITTI's layout.
 
-    The camera takes the poses' full motion, with pitch, roll and climbs (without those that its attitude contradicts,
-    because recorded altitudes drift while a car stands); the road lies 1.65 m under it and follows its
-    hills. Frames are 0.103 s apart. A drive follows from its name, its poses, the seed and the options alone, not from
-    the number of processes. Finished drives of the same options are kept, so that an interrupted call can be repeated;
-    a drive that is there is always complete.
+    The camera has the poses' full motion, with pitch, roll and climbs (without climbs that contradict its attitude,
+    because recorded altitudes drift while a car stands); the road is 1.65 m below it and follows the hills. Frames are
+    0.103 s apart. A drive is determined by its name, its poses, the seed and the options, not by the number of
+    processes. Finished drives with the same options are kept, so that an interrupted call can be repeated; a drive that
+    exists is always complete.
 
     Args:
         out: folder to write ``sequences/NAME/image_2``, ``calib.txt``, ``times.txt`` and ``poses/NAME.txt`` to.
         poses: folder of pose files ``NAME.txt``, a 3 x 4 camera-to-world matrix a row, such as the eleven of the
-            odometry benchmark. Without it the drives are invented, see :func:`random_drive`.
-        names: names of the drives, or one name; by default all pose files, or ``"00"`` to ``"10"`` when invented.
+            odometry benchmark. Without it the drives are random, see :func:`random_drive`.
+        names: names of the drives, or one name; by default all pose files, or ``"00"`` to ``"10"`` for random drives.
         size: (H, W) of the images.
-        frames: images of a drive, at most; by default all poses, or 300 when invented.
-        seed: another seed gives other scenes (and other invented drives) of the same names.
+        frames: largest number of images per drive; by default all poses, or 300 for random drives.
+        seed: another seed gives other scenes (and other random drives) of the same names.
         camera: ``image_2`` writes colour images, ``image_0`` grey ones.
-        focal: focal length as a share of the width; another one than KITTI's makes drives of other intrinsics.
-        traffic: whether there are moving cars and a wandering exposure.
-        processes: how many draw at a time; 1 draws in this process, None is one for each core. More than one needs
-            the caller's script to be importable, with ``if __name__ == "__main__":``.
+        focal: focal length relative to the width; a value other than KITTI's gives other intrinsics.
+        traffic: whether there are moving cars and a varying exposure.
+        processes: number of parallel processes; 1 draws in this process, None stands for one per core. More than one
+            needs the caller's script to be importable, with ``if __name__ == "__main__":``.
         overwrite: replace drives of other options. Only rendered drives are ever replaced.
         progress: called with the number of images that were written since the last call.
 
@@ -73,7 +72,7 @@ def render_drives(
         The names.
 
     Raises:
-        FileNotFoundError: if there are no pose files, or not those that are named.
+        FileNotFoundError: if there are no pose files, or a requested one is missing.
         ValueError: for malformed pose rows (naming file and line), drives of more than 50 km, fewer than two frames, a
             name that is not a plain folder name, and options out of range.
         FileExistsError: if there is another drive of that name.
@@ -174,10 +173,9 @@ def write_drives(
 ) -> list[str]:
     """Renders simple drives: random roads on level ground, with a level camera and without moving cars.
 
-    Written in the layout that :func:`torch_denkf.applications.car.read_kitti_drive` reads. A drive follows from its
-    name, the seed and the options alone, so one that is already there with the same options is kept. Writing 300 frames
-    of 50 x 150 takes about two seconds. Images are noisy by about 1.5 grey values. :func:`render_drives` makes harder
-    ones.
+    They have the layout of :func:`torch_denkf.applications.car.read_kitti_drive`. A drive is determined by its name,
+    the seed and the options, so that an existing drive with the same options is kept. Writing 300 frames of 50 x 150
+    takes about two seconds. The image noise is 1.5 grey values. :func:`render_drives` renders harder drives.
 
     Args:
         root: folder to write ``sequences/NAME/image_2``, ``calib.txt``, ``times.txt`` and ``poses/NAME.txt`` to.
@@ -207,7 +205,7 @@ def write_drives(
     root, names = Path(root).expanduser(), [names] if isinstance(names, str) else list(names)
     size = _checked_size(size)
     _check(names, frames)
-    for name in names:  # one after another: those before one that fails are there
+    for name in names:  # one by one, so that drives before a failing one are complete
         options = {"format": FORMAT, "frames": frames, "size": list(size), "seed": seed}
         rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
         track = state_to_poses(random_drive(frames, rng))

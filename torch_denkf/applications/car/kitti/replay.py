@@ -1,4 +1,4 @@
-"""KITTI's odometry drives as one of torchrl's data sets."""
+"""TorchRL data set of KITTI's odometry drives."""
 
 from __future__ import annotations
 
@@ -24,50 +24,51 @@ __all__ = ["KITTIOdometryExperienceReplay"]
 
 
 class KITTIOdometryExperienceReplay(EpisodeReplay):
-    """Drives in the layout of KITTI's odometry benchmark, as a replay buffer of their frames.
+    """Replay buffer of drives in the layout of KITTI's odometry benchmark.
 
-    An episode is a drive as one camera saw it, or its mirror image. Keys, samples and splits are those of
+    An episode is a drive of one camera, or its mirror image. Keys, samples and splits are those of
     :class:`~torch_denkf.data.EpisodeReplay`; here the readings are
 
     ===================== ============ ===========================================================================
     key                   shape        content
     ===================== ============ ===========================================================================
     ``pixels``            [n,2C,H,W]   float32: frame t in [0, 1], then the difference of frames t and t-1
-    ``flow``, ``road``    [n,3,h,w]..  float32, where ``flow`` adds them, see ``with_motion``
-    ``state``             [n,5]        float32, the truth: x m, y m, θ rad, v m/s, θ_dot rad/s
-    ``observed``          [n,1]        bool: frames t and t-1 are both there
+    ``flow``, ``road``    [n,3,h,w]..  float32, if ``flow`` adds them, see ``with_motion``
+    ``state``             [n,5]        float32, ground truth: x m, y m, θ rad, v m/s, θ_dot rad/s
+    ``observed``          [n,1]        bool: frames t and t-1 both exist
     ``dt``                [n,1]        float32, s: the drive's median frame time
     ``frame``             [n,1]        int64, the frame's number in the drive
     ``calibration``       [n,4]        float32: fx, fy, cx, cy in pixels of ``size``
     ===================== ============ ===========================================================================
 
-    as :func:`torch_denkf.applications.car.kitti.frames.frames_at` makes them. Pixels and flow come, when rows are
-    sampled, from the drives' memory-mapped frames, so that neither float images nor mirrored copies are kept. All of
-    KITTI takes 0.5 GB on disk at 50 x 150 in colour for each camera.
+    as :func:`torch_denkf.applications.car.kitti.frames.frames_at` makes them. Pixels and flow are computed from the
+    drives' memory-mapped frames when rows are sampled, so that neither float images nor mirrored copies are stored. All
+    of KITTI takes 0.5 GB on disk at 50 x 150 in colour for each camera.
 
     Poses are those of the left grey camera, as in the benchmark; the others are next to it, at most 0.5 m.
 
-    ``drives`` names the drives of the split ``"train"``, the default: none is for tests unless ``test_share`` says so.
-    All cameras and mirror images of a drive are on the same side.
+    By default all ``drives`` are in the split ``"train"``, and ``test_share`` moves some to ``"test"``. All cameras and
+    mirror images of a drive are in the same split.
 
     Args:
-        root: folder that holds ``sequences`` and ``poses``.
+        root: folder with ``sequences`` and ``poses``.
         drives: names of the drives, such as ``["00", "02"]``; by default all that have images and poses.
         cameras: ``"first"`` as :func:`torch_denkf.applications.car.read_kitti_drive` chooses it; ``"both"`` for each of
             ``image_2`` and ``image_3`` that has images, or else of ``image_0`` and ``image_1``; or names of folders,
             which every drive must have.
         mirrored: True adds each episode's mirror image, see
             :func:`torch_denkf.applications.car.kitti.mirror.mirror_drive`.
-        colour: True for three channels, False for a grey one, None for what the files have.
+        colour: True for three channels, False for a grey one, None for the channels of the files.
         size: (H, W) to scale the images to.
-        flow: True adds ``"flow"`` and ``"road"`` by :func:`torch_denkf.applications.car.with_motion`, kept in the same
-            cache. Or what else adds ``"flow"`` to a drive, called once for each drive and camera, such as
+        flow: True adds ``"flow"`` and ``"road"`` by :func:`torch_denkf.applications.car.with_motion`, with the same
+            cache. A function that adds ``"flow"`` to a drive is called once for each drive and camera, such as
             ``partial(with_motion, keep_images=False)``: samples then have no pixels.
-        test_share: share of the drives that are for tests, by a hash of their names.
+        test_share: share of the drives in the test split, by a hash of their names.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Attributes:
-        episodes: what each ``"episode"`` is, with its ``drive``, ``camera`` and whether it is ``mirrored``.
+        episodes: episode of each number in ``"episode"``, with its ``drive``, ``camera`` and whether it is
+            ``mirrored``.
 
     Raises:
         FileNotFoundError: without the folder, a drive's images, poses or calibration.
@@ -131,20 +132,20 @@ class KITTIOdometryExperienceReplay(EpisodeReplay):
         )
 
     def _number_statistics(self, rows: TensorDictBase) -> dict[str, Any]:
-        """Adds those of ``"velocity"`` ``[2]``, v m/s and θ_dot rad/s; θ_dot's mean is 0 if mirrored."""
+        """Adds statistics of ``"velocity"`` ``[2]``, v m/s and θ_dot rad/s; θ_dot's mean is 0 if mirrored."""
         return {**super()._number_statistics(rows), "velocity": mean_and_std(rows["state"][:, 3:])}
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
         """Returns statistics of frames over rows that have one, and of differences over observed rows."""
         if "image" not in self._drives[0]:
             return None
-        copies = len(self._all_episodes) // len(self._drives)  # a mirror image has the same figures
+        copies = len(self._all_episodes) // len(self._drives)  # a mirror image has the same statistics
         roles = self._roles[::copies]
         return _pixel_statistics([drive for drive, role in zip(self._drives, roles, strict=True) if role == "train"])
 
 
 class _Frames:
-    """Pixels and flow of rows, from the frames of their drives."""
+    """Computes pixels and flow of rows from the frames of their drives."""
 
     def __init__(self, drives: Sequence[TensorDictBase], episodes: Sequence[KITTIEpisode]):
         self._drives, self._mirrored = list(drives), [episode.mirrored for episode in episodes]
@@ -152,7 +153,7 @@ class _Frames:
         self._starts = torch.tensor([episode.start for episode in episodes])
 
     def __call__(self, row: Tensor) -> dict[str, Tensor]:
-        """Returns the pictures of rows ``[m]`` of the whole data set."""
+        """Returns pixels and flow of rows ``[m]`` of the whole data set."""
         number = torch.searchsorted(self._starts, row, right=True) - 1
         out: dict[str, Tensor] = {}
         for episode in number.unique().tolist():
@@ -167,7 +168,7 @@ class _Frames:
 
 
 def _rows(drive: TensorDictBase, mirrored_width: int | None) -> TensorDict:
-    """Returns the rows of an episode as the buffer stores them."""
+    """Returns the stored rows of an episode."""
     row = torch.arange(len(drive))
     rows = drive.select("state", "time", "dt", "frame", "calibration")
     if mirrored_width is not None:
@@ -182,7 +183,7 @@ def _pixel_statistics(drives: Sequence[TensorDictBase], chunk: int = 256) -> dic
         for index in torch.arange(len(drive)).split(chunk):
             frames = frames_at(drive, index)
             pixels = frames["pixels"]
-            # What is missing is zero and adds nothing to the sums; summed by image first, float32 is exact enough.
+            # Missing frames are zero and do not change the sums; sums over single images are exact enough in float32.
             total = total + pixels.sum((-2, -1)).double().sum(0)
             square = square + pixels.square().sum((-2, -1)).double().sum(0)
             seen = torch.stack([drive["frame_valid"][index].sum(), frames["observed"].sum()]).double()

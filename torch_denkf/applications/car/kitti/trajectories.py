@@ -1,4 +1,4 @@
-"""Trajectory files in KITTI's and TUM's layout, which evo and the benchmarks' own tools read."""
+"""Trajectory files in KITTI's and TUM's layout, for evo and the benchmarks' tools."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch_denkf.deployment.files import replacing
 
 __all__ = ["write_trajectory"]
 
-#: First line of a TUM file. Poses of a caller's own have the caller's axes.
+#: First line of a TUM file. Poses that a caller passes have the caller's axes.
 _COLUMNS = "time_s x_m y_m z_m qx qy qz qw"
 _AXES = "; axes of KITTI's camera: x to the right, y down, z forward"
 
@@ -29,7 +29,7 @@ def write_trajectory(
     """Writes a path as a file of camera-to-world poses, in metres.
 
     A planar state (x, y, θ, ...) becomes the poses of a level camera with KITTI's axes, right, down and forward: the
-    forward x of the state is the z of the file, its leftward y is minus the x of the file. Both layouts hold the same
+    forward x of the state is the z of the file, its leftward y is minus the x of the file. Both layouts have the same
     poses, so that files of different layouts can be compared.
 
     ========= =============================================================================================
@@ -43,18 +43,18 @@ def write_trajectory(
     ``evo_ape kitti truth.txt filter.txt --plot --plot_mode xz`` compares two of them.
 
     Args:
-        file: to write; its folder is made.
+        file: output file; its folder is created.
         trajectory: states ``[T, S]`` that begin with x m, y m and θ rad; or poses ``[T, 3, 4]`` or ``[T, 4, 4]``.
-        times: increasing seconds, ``[T]`` or ``[T, 1]``; needed for ``"tum"`` alone.
+        times: increasing seconds, ``[T]`` or ``[T, 1]``; only needed for ``"tum"``.
         layout: ``"kitti"`` or ``"tum"``.
 
     Returns:
         The file.
 
     Raises:
-        ValueError: for another layout, for shapes that do not fit, for values that are not finite, and for TUM files
-            without increasing times.
-        OSError: if the file cannot be written, as on a full disk; an earlier one is then as it was.
+        ValueError: for an unknown layout, shapes that do not match, values that are not finite, and TUM files without
+            increasing times.
+        OSError: if the file cannot be written, as on a full disk; an existing file is then unchanged.
 
     Example:
         >>> import tempfile, torch

@@ -1,4 +1,4 @@
-"""Writes rendered drives: in stretches, in several processes, and so that a drive that is there is complete."""
+"""Writes rendered drives in chunks and parallel processes; a drive that exists is complete."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from torch_denkf.applications.car.vision.poses import KITTI_DT, poses_to_state
 from torch_denkf.deployment.files import clear_errors, place_beside, sync
 from torch_denkf.deployment.workers import follow_parent
 
-FORMAT = 3  # raise it when drives of the same options come out differently
+FORMAT = 3  # raise it when the drives of the same options change
 MARKER = "drive.json"
-STRETCH = 500  # frames that a process draws at a time; another process would have to make the scene again
-REPORTED = 40  # frames after which the only process says how far it is
+STRETCH = 500  # frames per task; each process must build the scene again
+REPORTED = 40  # frames between progress reports of a single process
 GRAIN = 1.5  # grey values: standard deviation of the images' noise
 
 
@@ -36,13 +36,13 @@ class Job:
 
     Attributes:
         root: folder that gets ``sequences`` and ``poses``.
-        name: of the drive.
+        name: name of the drive.
         poses: camera-to-world matrices, ``[N, 3, 4]``.
-        camera: what it is seen with.
-        folder: of the images; ``image_0`` and ``image_1`` are grey.
+        camera: camera of the images.
+        folder: folder of the images; ``image_0`` and ``image_1`` are grey.
         traffic: whether cars move.
-        options: what the drive follows from, for its marker; ``seed`` is one of them.
-        beside: the folder it is written to before it is complete.
+        options: options that determine the drive, for its marker, including ``seed``.
+        beside: temporary folder until the drive is complete.
     """
 
     root: Path
@@ -63,7 +63,7 @@ class Job:
         """Returns True if the drive exists already.
 
         Raises:
-            FileExistsError: if another one is, which may not be replaced.
+            FileExistsError: if another drive exists that may not be replaced.
         """
         if not self.target.exists():
             return False
@@ -105,10 +105,10 @@ class Job:
                 file.write_bytes(data.tobytes())
 
     def finish(self) -> None:
-        """Writes the text files and renames: a drive that exists is complete.
+        """Writes the text files and renames the folder: a drive that exists is complete.
 
-        After a power failure an image may be missing all the same: its reader says so. To wait for thousands of
-        images to be on the disk would take as long as to draw them.
+        After a power failure an image may still be missing, for which the reader raises: syncing thousands of images
+        would take as long as drawing them.
         """
         with clear_errors(self.target, beside=self.beside):
             self._finish()
@@ -133,7 +133,7 @@ def write(jobs: list[Job], processes: int, progress: Callable[[int], object] | N
 
     Args:
         jobs: the drives, all of one root.
-        processes: how many draw at a time; 1 draws in this process.
+        processes: number of parallel processes; 1 draws in this process.
         progress: called with the number of images that were written since the last call.
 
     Raises:
@@ -191,7 +191,7 @@ def _write(jobs: list[Job], processes: int, progress: Callable[[int], object] | 
         _last.clear()
 
 
-_last: dict[Path, Renderer] = {}  # the drive that this process draws, whose scene serves its next stretch, too
+_last: dict[Path, Renderer] = {}  # renderer of this process's drive, reused for the next chunk
 
 
 def _start_worker() -> None:

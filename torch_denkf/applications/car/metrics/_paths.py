@@ -23,11 +23,11 @@ def step_lengths(path: Tensor) -> Tensor:
 
 
 def relative_pose_error(start: Tensor, end: Tensor, true_start: Tensor, true_end: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the error of the relative pose: how far two motions end from each other if they begin at the same pose.
+    """Returns the relative pose error: difference of the end poses of two motions, aligned at their start.
 
     Args:
-        start: estimated poses (x m, y m, θ rad) where the motions begin, ``[*B, 3]``.
-        end: estimated poses where they end, ``[*B, 3]``.
+        start: estimated poses (x m, y m, θ rad) at the start of the motions, ``[*B, 3]``.
+        end: estimated poses at their end, ``[*B, 3]``.
         true_start: see ``start``.
         true_end: see ``end``.
 

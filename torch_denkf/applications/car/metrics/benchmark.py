@@ -1,4 +1,4 @@
-"""The rows of the tables on KITTI: one error for each number of steps, N = 100, 200, 400 and 800."""
+"""Errors on KITTI for the first N = 100, 200, 400 and 800 steps, as in the paper's table."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["WindowErrors", "kitti_pathlength_error"]
 
 
 class WindowErrors(NamedTuple):
-    """Errors by the number of steps; ``*B`` are the batch dims of the paths, W the number of windows that fit.
+    """Errors over the first N steps; ``*B`` are the batch dims of the paths, W the number of values of N.
 
     Attributes:
         translation: mean over the windows' lengths, in m/m, ``[*B]``.
         rotation: mean over the windows' lengths, in deg/m, ``[*B]``.
-        window_translation: that of each length, in m/m, ``[*B, W]``.
-        window_rotation: that of each length, in deg/m, ``[*B, W]``.
-        windows: the lengths, in steps.
+        window_translation: error for each length, in m/m, ``[*B, W]``.
+        window_rotation: error for each length, in deg/m, ``[*B, W]``.
+        windows: the lengths N, in steps.
     """
 
     translation: Tensor
@@ -34,25 +34,25 @@ class WindowErrors(NamedTuple):
 def kitti_pathlength_error(
     estimated: Tensor, truth: Tensor, *, windows: Sequence[int] = (100, 200, 400, 800)
 ) -> WindowErrors:
-    """Returns errors as in the DEnKF reference script, behind the paper's table: lengths of paths, not their ends.
+    """Returns errors of path lengths, as the reference script of the DEnKF paper computes them for its table.
 
     Over the first N steps of a run: the difference between the lengths of both paths, and the difference between both
-    headings at step N as they are, each divided by the length of the true path.
+    unwrapped headings at step N, each divided by the length of the true path.
 
-    The translation is **blind** to where the path goes: a path in the wrong direction, or round a circle, at the right
-    speed scores 0, and being too fast first and too slow later cancels. The rotation sees the last heading alone, whose
-    errors on the way may cancel; it is not wrapped, so that an estimate that is right but for a whole turn scores
-    360 deg, and wrapped angles must be unwrapped first. One run counts, from its first row. Report
-    the mean of :func:`~torch_denkf.applications.car.metrics.odometry.kitti_endpoint_error` over the same windows
-    next to it, which is what the other papers' numbers are.
+    The translation error **ignores** the direction of the path: a path in the wrong direction, or in a circle, at the
+    right speed scores 0, and speed errors of opposite sign cancel. The rotation error depends on the last heading only,
+    so that errors on the way may cancel; it is not wrapped, so that an error of a full turn scores 360 deg, and wrapped
+    angles must be unwrapped first. Also report the mean of
+    :func:`~torch_denkf.applications.car.metrics.odometry.kitti_endpoint_error` over the same windows, the metric of the
+    other papers.
 
     Args:
         estimated: poses (x m, y m, θ rad), θ unwrapped, ``[*B, T, 3]``.
         truth: the true poses, of the same shape.
-        windows: N, numbers of steps; those of more than T - 1 are left out.
+        windows: values of N in steps; those above T - 1 are left out.
 
     Returns:
-        A :class:`WindowErrors`, where the mean over N is the table's "all lengths".
+        A :class:`WindowErrors`; the mean over N is the table's "all lengths".
 
     Raises:
         ValueError: if the shapes are not ``[*B, T, 3]`` or differ, if no window fits, or if a car stands still for a
@@ -62,7 +62,7 @@ def kitti_pathlength_error(
         Liu et al. 2023, arXiv:2308.09870, Table II, by the script published with it (``result_analysis.py``).
 
     Examples:
-        The truth drives straight on; the estimate drives off at a right angle, as fast.
+        The true path is straight; the estimate has the same speed at a right angle.
 
         >>> x = torch.arange(101.0)
         >>> truth, estimated = torch.zeros(2, 101, 3)

@@ -1,4 +1,4 @@
-"""The error of KITTI's leaderboard: drift per metre over 100 to 800 metres of the road."""
+"""The error of KITTI's odometry leaderboard: drift per metre over segments of 100 to 800 metres."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class DevkitError(NamedTuple):
     Attributes:
         translation: t_rel, mean over all segments of all lengths, in %, ``[*B]``.
         rotation: r_rel, mean over the same segments, in deg/m, ``[*B]``.
-        length_translation: mean over the segments of each length, in %, ``[*B, L]``; NaN where none fits.
+        length_translation: mean over the segments of each length, in %, ``[*B, L]``; NaN if no segment fits.
         length_rotation: mean over the segments of each length, in deg/m, ``[*B, L]``.
-        segments: how many segments of each length there are, ``[*B, L]``, int64.
+        segments: number of segments of each length, ``[*B, L]``, int64.
     """
 
     translation: Tensor
@@ -39,18 +39,18 @@ def kitti_devkit_error(
     lengths: Sequence[float] = (100, 200, 300, 400, 500, 600, 700, 800),
     step: int = 10,
 ) -> DevkitError:
-    """Returns the relative pose error of all segments of 100, 200, ..., 800 **metres**, for each metre.
+    """Returns the relative pose error per metre, over all segments of 100, 200, ..., 800 **metres**.
 
-    As KITTI's development kit does: a segment begins at every tenth frame and ends with the first frame that lies more
-    than its length further along the true path; the estimate is laid on the truth at its start; its error is divided by
-    the nominal length. The mean is over segments, so long drives and short lengths have more weight. Of points of
-    :class:`~torch_denkf.functional.manifolds.SE3` it is the development kit's. Of planar poses it leaves out height,
-    roll and pitch, and is a little smaller than the leaderboard's figure for the same filter.
+    As in KITTI's development kit, a segment begins at every tenth frame, and ends with the first frame that lies more
+    than its length further along the true path. The estimate is aligned with the truth at the segment's start, and the
+    error at its end is divided by the nominal length. The mean is over segments, so long drives and short lengths have
+    more weight. For poses in :class:`~torch_denkf.functional.manifolds.SE3` the result is the development kit's. For
+    planar poses the error leaves out height, roll and pitch, and is a little smaller than the leaderboard's.
 
     Args:
         estimated: poses (x m, y m, θ rad), ``[*B, T, 3]``, or (quaternion, position in m), ``[*B, T, 7]``.
         truth: the true poses, of the same shape.
-        lengths: of the segments, in m; where the path is too short, those that fit count.
+        lengths: lengths of the segments, in m; lengths that do not fit into a path are left out.
         step: frames between the starts of segments.
 
     Returns:
@@ -64,7 +64,7 @@ def kitti_devkit_error(
         Geiger, Lenz & Urtasun 2012, CVPR; the odometry development kit, ``evaluate_odometry.cpp``.
 
     Examples:
-        A tenth too fast on a straight line; each segment of 100 steps more than 100 m has one step more.
+        A speed error of 10 % on a straight line. A segment ends beyond 100 m, after 101 steps of 1 m: 10.1 %.
 
         >>> x = torch.arange(151.0)
         >>> truth = torch.stack([x, 0 * x, 0 * x], -1)
@@ -109,7 +109,7 @@ def kitti_devkit_error(
 
 
 def _spatial_error(start: Tensor, end: Tensor, start_true: Tensor, end_true: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns distance in m and angle in rad between the motions of both paths; points of SE3 ``[*, 7]``."""
+    """Returns distance in m and angle in rad between the motions of both paths, from points of SE3 ``[*, 7]``."""
     space = SE3()
     moved, moved_true = (space.compose(space.inverse(a), b) for a, b in ((start, end), (start_true, end_true)))
     left = space.compose(space.inverse(moved), moved_true)
@@ -117,6 +117,6 @@ def _spatial_error(start: Tensor, end: Tensor, start_true: Tensor, end_true: Ten
 
 
 def _rows(path: Tensor, index: Tensor) -> Tensor:
-    """Returns rows ``[*B, F, L]`` of a path ``[*B, T, N]``, each path its own."""
+    """Returns the poses of a path ``[*B, T, N]`` at indices ``[*B, F, L]``."""
     flat = index.flatten(-2).unsqueeze(-1).expand(*index.shape[:-2], -1, path.shape[-1])
     return path.gather(-2, flat).reshape(*index.shape, path.shape[-1])

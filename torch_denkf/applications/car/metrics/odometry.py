@@ -1,11 +1,10 @@
-r"""Odometry errors on KITTI: how far a filter's path ends from the truth, for each metre travelled.
+r"""Odometry errors on KITTI: end-point error per metre travelled.
 
 Poses are ``(x, y, θ)``: metres forward, metres left, radians to the left. The metric is that of Jonschkowski & Brock
 2018 (differentiable particle filters), Haarnoja et al. 2016 (backprop KF) and Kloss et al. 2021 (how to train your
 differentiable filter): for every window of N steps the distance between both end points and the difference of both
-final headings, each divided by the length of the true path, averaged over windows. A path that goes the wrong way at
-the right speed therefore has a large error, other than with the difference of path lengths that
-the reference script of the DEnKF paper computes.
+final headings, each divided by the length of the true path, averaged over windows. A path in the wrong direction at the
+right speed therefore has a large error, unlike with the path-length error of the DEnKF paper's reference script.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ class EndpointError(NamedTuple):
     """Result of :func:`kitti_endpoint_error`; ``*B`` are the batch dims of the paths, W the number of windows.
 
     Attributes:
-        translation: mean end point error over the windows that count, in m/m, ``[*B]``.
+        translation: mean end point error over the valid windows, in m/m, ``[*B]``.
         rotation: mean error of the final heading over the same windows, in deg/m, ``[*B]``.
-        window_translation: each window's, in m/m, ``[*B, W]``; NaN in windows left out.
-        window_rotation: each window's, in deg/m, ``[*B, W]``; NaN in windows left out.
-        windows: how many windows count, ``[*B]``, int64.
+        window_translation: error of each window, in m/m, ``[*B, W]``; NaN in windows left out.
+        window_rotation: error of each window, in deg/m, ``[*B, W]``; NaN in windows left out.
+        windows: number of valid windows, ``[*B]``, int64.
     """
 
     translation: Tensor
@@ -48,21 +47,20 @@ def kitti_endpoint_error(
     align: bool = True,
     min_length: float = 1.0,
 ) -> EndpointError:
-    """Returns the end point error of every window of ``window`` steps, for each metre of the true path.
+    """Returns the end point error of every window of ``window`` steps, per metre of the true path.
 
     Window i compares rows i and i + ``window``, so a path of T rows has ``(T - window - 1) // stride + 1`` windows.
-    The car stands still in some: windows whose true path is shorter than ``min_length`` are left out, because an
-    error for each metre says nothing there.
+    Windows whose true path is shorter than ``min_length`` are left out, because an error per metre is meaningless for a
+    standing car.
 
     Args:
         estimated: poses (x m, y m, θ rad), ``[*B, T, 3]``.
         truth: the true poses, of the same shape.
         window: N, in steps (not metres); the literature reports 100, 200, 400 and 800.
         stride: steps between the starts of two windows.
-        align: lay the first estimated pose of each window on the true one, by a shift and a turn, so that only what
-            happens within the window counts, as if the filter had started there from the truth. Otherwise the error is
-            that of the poses as they are.
-        min_length: the shortest true path that counts, in m.
+        align: align the first estimated pose of each window with the true one, by a translation and a rotation, so that
+            only errors within the window count. Otherwise the poses are compared without alignment.
+        min_length: shortest true path of a valid window, in m.
 
     Returns:
         An :class:`EndpointError`.
@@ -76,7 +74,7 @@ def kitti_endpoint_error(
         arXiv:2012.14313, section 6.
 
     Examples:
-        A car on a straight line whose speed is overestimated by a tenth, and nothing else.
+        A car on a straight line whose speed is overestimated by a tenth.
 
         >>> x = torch.arange(201.0)
         >>> truth = torch.stack([x, 0 * x, 0 * x], -1)
@@ -116,10 +114,10 @@ def kitti_endpoint_error(
 
 
 def dead_reckoning(velocities: Tensor, initial: Tensor, dt: float | Tensor) -> Tensor:
-    """Integrates speed and turn rate to a path: what odometry alone gives, without a filter.
+    """Integrates speed and turn rate to a path (dead reckoning, without a filter).
 
-    Row t moves along the heading half way between rows t-1 and t, ``θ_{t-1} + θ_dot_t dt / 2``, which is exact for the
-    chord of a circular arc. Differentiable in all arguments.
+    Step t moves along the mean heading of rows t-1 and t, ``θ_{t-1} + θ_dot_t dt / 2``, which is exact for the chord of
+    a circular arc. Differentiable in all arguments.
 
     Args:
         velocities: (v m/s, θ_dot rad/s), ``[*B, T, 2]``; row t is the motion from t-1 to t, so that row 0 is not used.
@@ -127,8 +125,8 @@ def dead_reckoning(velocities: Tensor, initial: Tensor, dt: float | Tensor) -> T
         dt: time between rows in s.
 
     Returns:
-        Poses (x m, y m, θ rad), ``[*B, T, 3]``; row 0 is ``initial``, and θ is not wrapped. Sums over thousands of
-        rows are a reason to pass float64.
+        Poses (x m, y m, θ rad), ``[*B, T, 3]``; row 0 is ``initial``, and θ is not wrapped. Pass float64 for thousands
+        of rows.
 
     Raises:
         ValueError: if the shapes do not fit.

@@ -17,20 +17,20 @@ from torch_denkf.modules.stochastic import StochasticMLP
 
 __all__ = ["FlowSensor"]
 
-_FLOW_UNIT, _TURN_UNIT = 0.1, 0.02  # tangents and rad a frame: about a standard deviation on KITTI
-_ROAD_LOC, _ROAD_SCALE = 0.9, 0.2  # where correlations of the road lie
+_FLOW_UNIT, _TURN_UNIT = 0.1, 0.02  # flow in tangents and turn in rad, per frame: about a standard deviation on KITTI
+_ROAD_LOC, _ROAD_SCALE = 0.9, 0.2  # mean and spread of the road's correlations
 _PITCH_UNIT = 0.005  # rad: about the error of the direction of travel
 _CORNER_CUES = 5  # see _MotionTrunk._corner_cues
-_CORNER_TRUST = 2.0  # log odds of the corners' turn against the flow's, before training
+_CORNER_TRUST = 2.0  # initial log odds of the corners' turn against the flow's
 
 
 class _MotionTrunk(nn.Module):
-    """Distance and turn between two frames by geometry, and features that say how to correct them.
+    """Computes distance and turn between two frames by geometry, and features for their correction.
 
-    The road's correlations become a distribution over pitch and distance, by a small convolutional network that may
-    look at the neighbours of each, and by the direction of travel: the road lies along it, so it tells the camera's
-    pitch, which the correlations alone hardly see. The turn is that of the same fit, or the median flow ahead where a
-    network trusts that more, as on an empty motorway; or that of tracked corners, where they are read.
+    A small convolutional network turns the road's correlations into a distribution over pitch and distance. The
+    direction of travel is parallel to the road and thus gives the camera's pitch, which the correlations alone hardly
+    determine. The turn is a learned mixture of the geometric fit, the median flow ahead (better on an empty motorway),
+    and tracked corners, if they are an input.
     """
 
     distances: torch.Tensor
@@ -106,28 +106,28 @@ class _MotionTrunk(nn.Module):
 
     @staticmethod
     def _corner_cues(two_view: torch.Tensor, turned: torch.Tensor, pitch: torch.Tensor) -> list[torch.Tensor]:
-        """Returns the confidence of corners in turn and pitch, and their agreement with the flow; zeros without."""
+        """Returns confidences of the corners' turn and pitch, and differences from the flow; 0 without corners."""
         left, *_, down, turn_std, pitch_std, inliers = two_view.unbind(1)
         seen = inliers > 0
         doubts = [(turn_std / _TURN_UNIT).clamp_min(1e-4).log() + 4, (pitch_std / _PITCH_UNIT).clamp_min(1e-4).log()]
-        # A fit that went wrong may be far off: what is compared is bounded.
+        # Failed fits may be outliers: differences are bounded.
         apart = [((left - turned) / _TURN_UNIT).tanh(), (down / _PITCH_UNIT - pitch).div(4).tanh()]
         return [torch.where(seen, cue, 0.0) for cue in (*doubts, *apart)] + [inliers]
 
 
 class FlowSensor(StochasticSensor):
-    """Speed and turn rate of a car from optical flow and the road's correlation, for each ensemble member.
+    """Estimates speed and turn rate of a car from optical flow and road correlation, for each ensemble member.
 
-    Geometry gives a first reading: the distance at which the road of two frames agrees, for the camera's pitch that the
-    flow's focus of expansion tells, and the turn that the same fit gives, or the median flow far ahead. A small network
-    weighs the distances, and a stochastic head corrects both readings for each member. What it reads is in angles and
-    metres, so that one sensor serves cameras with other intrinsics and resolutions, and what it learned on rendered
-    drives holds on real ones.
+    Geometry gives a first estimate: the distance with the best correlation of the road in two frames, at the camera's
+    pitch from the flow's focus of expansion, and the turn from the same fit or from the median flow far ahead. A small
+    network weights the distances, and a stochastic head corrects both estimates for each member. Inputs are in angles
+    and metres, so that one sensor serves cameras with other intrinsics and resolutions, and transfers from rendered to
+    real drives.
 
     Args:
         dt: time between frames in s.
         ensemble_size: E.
-        features: of the flow's code.
+        features: size of the flow's code.
         num_cells: widths of the head's hidden layers.
         layer: ``"dropout"`` or ``"flipout"``, see :class:`StochasticMLP`.
         rate: drop probability of the head's hidden units.
@@ -136,17 +136,16 @@ class FlowSensor(StochasticSensor):
             :class:`~torch_denkf.applications.car.OpticalFlow` or ``with_motion`` writes them.
         out_key: learned observations (v m/s, θ_dot rad/s) ``[*B, E, 2]``.
         two_view_key: the motion of tracked corners ``[*B, 8]``
-            (:func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`), if the sensor is to read it as a
-            third input: it tells the turn two to three times better than the flow does.
-        encoding_key: where to write what the head reads, ``[*B, encoding_features]``; the noise model can tell a
-            blurred frame from a sharp one by it. None for nowhere.
-        observed_key: optional mask ``[*B, 1]``; frames that are not observed are not read.
+            (:func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`), as an optional third input: its turn
+            is two to three times more accurate than the flow's.
+        encoding_key: key for the head's input, ``[*B, encoding_features]``, from which a noise model can recognise
+            blurred frames. None does not write it.
+        observed_key: optional observed mask ``[*B, 1]``; other frames are replaced by zeros.
 
     Raises:
         ValueError: if an input does not have the shape above.
 
-    Source:
-        The paper's sensor (section III, eq. 8) with another trunk; the plane of the road as in Geiger, Ziegler &
+    Source: Paper's sensor (section III, eq. 8) with another trunk; the plane of the road as in Geiger, Ziegler &
         Stiller 2011, "StereoScan", for monocular scale;
         :func:`torch_denkf.applications.car.vision.expansion.focus_of_expansion`.
 
@@ -191,7 +190,7 @@ class FlowSensor(StochasticSensor):
         self.dt, self.ensemble_size, self.encoding_features = float(dt), ensemble_size, trunk.out_features
 
     def compute(self, *values, noise, batch_size):
-        """Returns the learned observations of every member, and the encoding if it is asked for."""
+        """Returns the learned observations of every member, and the encoding if ``encoding_key`` is set."""
         *inputs, observed = values
         inputs = [self._frames(value, index, observed, batch_size) for index, value in enumerate(inputs)]
         moved, turned, encoding = self.module["trunk"](*inputs)
@@ -213,7 +212,7 @@ class FlowSensor(StochasticSensor):
             )
         value = value.to(self.module["trunk"].distances.dtype)
         if observed is not None:
-            # A frame that was not seen may hold NaN, which would poison the gradients even behind a mask.
+            # An unobserved frame may be NaN, which would make gradients NaN even with a mask.
             seen = observed.any(-1).reshape(*batch_size, *(1,) * len(expected))
             value = torch.where(seen, value, 0.0)
         return value.reshape(batch_size.numel(), *expected)
@@ -228,7 +227,7 @@ def _grid(height: int, width: int) -> torch.Tensor:
 def _median_turn(flow: torch.Tensor) -> torch.Tensor:
     """Estimates the turn to the left from a batch of coarse flows, as ``median_turn`` of ``vision/flow.py`` does."""
     height, width = flow.shape[-2:]
-    side = int(0.375 * width)  # as much on both sides: where things come nearer, their flows cancel
+    side = int(0.375 * width)  # a symmetric region, in which the flow of expansion cancels
     ahead = flow[:, 0, int(0.33 * height) : int(0.5 * height), side : width - side].flatten(1)
     middle = ahead.shape[1] // 2
     ordered = ahead.sort(1).values  # torch's median would take the lower of two middle values

@@ -1,4 +1,4 @@
-"""A gain and an offset of what each member predicts to be read, drawn once."""
+"""Constant calibration errors of a sensor as a fixed gain and offset of each member."""
 
 from __future__ import annotations
 
@@ -16,36 +16,35 @@ __all__ = ["MemberGain"]
 
 
 class MemberGain(SubModel):
-    r"""Gives what each member predicts a factor and an offset of its own: :math:`\hat y^i c e^{\sigma z^i} + n b^i`.
+    r"""Applies a fixed gain and offset to each member's prediction: :math:`\hat y^i c e^{\sigma z^i} + n b^i`.
 
-    A camera that is mounted a little lower reads all speeds a little too high, today and tomorrow. Drawn again for each
-    frame, such an error averages out over time, and the filter becomes too sure of itself; or its noise model takes the
-    error for white noise, and the filter follows too slowly. Here the :math:`z^i` are the normal quantiles of E
-    members, always the same: each member keeps its calibration, the ensemble its doubt. Put it behind the observation.
+    A camera that is mounted too low has a constant scale error of the speed. As white noise, such an error would
+    average out over time, and the filter would become overconfident; or the noise model would become too large, and the
+    filter too slow. Here the :math:`z^i` are fixed normal quantiles of E members: each member keeps its gain, so that
+    the ensemble keeps the calibration uncertainty. Put it after the observation model.
 
-    An analysis draws member i to the speed y that was read over the member's gain. For the mean of the members to be y,
-    that of the gains' inverses must be 1, so :math:`c = \frac{1}{E} \sum_i e^{-\sigma z^i}`. Without it the speed would
-    be too high by the factor c, about :math:`e^{\sigma^2 / 2}`, and the path too long.
+    An analysis moves member i towards the reading y divided by the member's gain.
 
-    The offsets :math:`b^i` are normal quantiles, too, in another order. They are the doubt about an error that lasts,
-    but does not grow with what is read, as of a turn rate. A pair of frames n steps apart has it n times.
+    For a mean of y, the mean of the inverse gains must be 1, so :math:`c = \frac{1}{E} \sum_i e^{-\sigma z^i}`. Without
+    c, the speed would be too high by the factor c, about :math:`e^{\sigma^2 / 2}`, and the path too long. The offsets
+    :math:`b^i` are normal quantiles in another order. They represent a constant bias that does not scale with the
+    reading, as of a turn rate. A pair of frames n steps apart has the offset n times.
 
     Args:
         std: standard deviation :math:`\sigma` of the logarithm of the factor, for each observation dimension ``[O]``,
             before training; it is learned.
         ensemble_size: E.
         offset_std: standard deviation of the offset ``[O]``, in the observation's units; by default zero.
-        seed: of the order in which the members take the quantiles, for each dimension its own.
-        in_key: what the members predict, ``[*B, E, O]``.
-        out_key: where to write them, by default in their place.
-        steps_key: optional n ``[*B, 1]``, 1 where the key is not there.
+        seed: seed of the order of the quantiles, which differs for each dimension.
+        in_key: predictions of the members, ``[*B, E, O]``.
+        out_key: key of the output; by default ``in_key``.
+        steps_key: optional n ``[*B, 1]``; 1 by default.
 
     Raises:
-        ValueError: if a standard deviation is not positive, if that of an offset is negative, or if there is another
-            number of members.
+        ValueError: if a standard deviation is not positive, that of an offset is negative, or the number of members
+            differs.
 
-    Source:
-        The "consider" parameters of Schmidt (1966), which a filter doubts but does not estimate, as an ensemble.
+    Source: Consider parameters (Schmidt 1966), whose uncertainty is modelled without estimating them, as an ensemble.
 
     Example:
         >>> from tensordict import TensorDict
@@ -75,7 +74,7 @@ class MemberGain(SubModel):
         generator = torch.Generator().manual_seed(seed)
         levels = (torch.arange(ensemble_size, dtype=std.dtype) + 0.5) / ensemble_size
         quantiles = torch.special.ndtri(levels)
-        quantiles = quantiles / quantiles.square().mean().sqrt()  # few quantiles spread less than the distribution
+        quantiles = quantiles / quantiles.square().mean().sqrt()  # to variance one
         orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
         self.register_buffer("quantiles", torch.stack([quantiles[order] for order in orders], -1))
         offset_std = torch.zeros_like(std) if offset_std is None else as_standard_deviations("offset_std", offset_std)
@@ -85,7 +84,7 @@ class MemberGain(SubModel):
         self.register_buffer("places", torch.stack([quantiles[order] for order in orders], -1))
 
     def compute(self, predicted, steps=None):
-        """Returns the predictions, each with its member's gain, whose inverses' mean is 1, and with its offset."""
+        """Returns the predictions with each member's gain and offset."""
         if predicted.shape[-2:] != self.quantiles.shape:
             raise ValueError(
                 f"MemberGain was made for predictions [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "

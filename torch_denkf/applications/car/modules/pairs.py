@@ -1,9 +1,9 @@
-r"""Readings that span several steps: where frames are missing, a sensor can compare a frame with the last that arrived.
+r"""Observations over several steps: after missing frames, a sensor compares a frame with the last one that arrived.
 
-What it reads then is the way over the whole gap. A filter that is to learn from it must remember its own velocities of
-the past steps, "clones" in the words of Roumeliotis & Burdick (2002): either next to the state (:func:`with_history`,
-for :class:`torch_denkf.applications.car.UnicycleMotion`) or in it (:class:`ClonedPrior`, :class:`ClonedTransition`, for
-filters whose covariance or weights carry the pose along).
+Such an observation is the motion over the whole gap. The filter must then store its velocities of the past steps
+(stochastic cloning, Roumeliotis & Burdick 2002): either next to the state (:func:`with_history`, for
+:class:`torch_denkf.applications.car.UnicycleMotion`) or in it (:class:`ClonedPrior`, :class:`ClonedTransition`, for
+filters whose covariance or weights include the pose).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def with_history(
     ensemble_key: NestedKey = ("belief", "ensemble"),
     history_key: NestedKey = ("belief", "history"),
 ) -> AugmentedBelief:
-    """Returns an initial belief with a past: each member has had its present velocities all along.
+    """Returns an initial belief with a velocity history, filled with each member's present velocities.
 
     Args:
-        initial: the initial belief; writes an ensemble ``[*B, E, 5]``, see :class:`UnicycleTransition`.
+        initial: initial belief; writes an ensemble ``[*B, E, 5]``, see :class:`UnicycleTransition`.
         lags: past steps to carry, L: one less than the longest span of a reading.
-        ensemble_key: what ``initial`` writes.
+        ensemble_key: key of the ensemble of ``initial``.
         history_key: velocities (v m/s, theta_dot rad/s) of the last L steps, the latest first, ``[*B, E, L, 2]``.
 
     Raises:
@@ -66,26 +66,25 @@ class PairObservation(SubModel):
 
     .. math:: H x^i_t = h\Big(\sum_{k=0}^{n-1} (v, \dot\theta)^i_{t-k}\Big)
 
-    Where frames are missing, a pair of the last frame that arrived and the present one still measures the whole way
-    between them. The members carry their velocities of the past steps, and the analysis corrects those, too
-    ("stochastic cloning"); :class:`UnicycleMotion` then moves the pose over the gap again. Use with
-    ``EnsembleAnalysis(forecast_key=("forecast", "clone"), observed_key=("forecast", "observed"),
-    belief_prefix="analysis")`` and an initial belief :func:`with_history`.
+    After missing frames, a pair of the last available frame and the present one measures the motion between them. The
+    members carry their velocities of the past steps, which the analysis corrects, too (stochastic cloning);
+    :class:`UnicycleMotion` then repeats the motion over the gap. Use with ``EnsembleAnalysis(forecast_key=("forecast",
+    "clone"), observed_key=("forecast", "observed"), belief_prefix="analysis")`` and an initial belief
+    :func:`with_history`.
 
     Args:
-        reach: largest speed and turn rate of a whole pair ``[2]`` (m/s, rad/s) that the sensor can read, on both sides
-            of zero: where the forecast says more over a gap, by two standard deviations, the frame counts as not
-            observed.
-        curve: h, what the sensor reads at a true sum ``[*, 2]``, for one that hedges; by default the sum itself.
-        in_key: forecast ensemble ``[*B, E, 5]``, or with the past ``[*B, E, 5 + 2L]``.
-        history_key: see :func:`with_history`; ``None`` where the past is part of the state, see
+        reach: range of the sensor: largest absolute speed and turn rate of a whole pair ``[2]`` (m/s, rad/s). If the
+            forecast over a gap exceeds it by two standard deviations, the frame counts as not observed.
+        curve: h, mean reading at a true sum ``[*, 2]``, for a biased sensor; by default the sum itself.
+        in_key: forecast ensemble ``[*B, E, 5]``, or with the history ``[*B, E, 5 + 2L]``.
+        history_key: see :func:`with_history`; ``None`` if the history is part of the state, see
             :class:`ClonedTransition`.
-        steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 where there is no pair, 1 where
-            the key is not there. ``kitti.gaps.bridge_gaps`` counts them.
+        steps_key: optional number of steps n between the frames ``[*B, 1]``, int; 0 without a pair; by default 1.
+            ``kitti.gaps.bridge_gaps`` writes it.
         observed_key: optional mask ``[*B, 1]``.
         out_key: predicted observations ``[*B, E, 2]``.
-        clone_key: forecast and history side by side, ``[*B, E, 5 + 2L]``.
-        out_observed_key: the mask of what can be read, ``[*B, 1]``.
+        clone_key: forecast and history concatenated, ``[*B, E, 5 + 2L]``.
+        out_observed_key: mask of pairs within the range, ``[*B, 1]``.
 
     Source:
         Roumeliotis & Burdick 2002, "Stochastic cloning: a generalized framework for processing relative state
@@ -127,10 +126,10 @@ class PairObservation(SubModel):
         history = history[0] if history else forecast[..., 5:].unflatten(-1, (-1, 2))
         past = within_pair(steps, history)
         way = forecast[..., 3:5] + torch.where(past, history, 0.0).sum(-2)
-        # Neighbours are always read, and so is what the forecast knows little of: a filter whose belief is too
-        # fast would otherwise stay blind.
+        # Neighbours are always observed, and so are uncertain forecasts: a filter that overestimates the speed would
+        # otherwise stay without observations.
         least = way.mean(-2).abs()
-        if way.shape[-2] > 1:  # an extended Kalman filter asks at one point
+        if way.shape[-2] > 1:  # an extended Kalman filter evaluates one point
             least = least - 2 * ensemble_var(way).sqrt()
         within_reach = (least <= self.reach).all(-1, keepdim=True)
         readable = within_reach | ~past.flatten(-2).any(-1)
@@ -141,7 +140,7 @@ class PairObservation(SubModel):
 
 
 class ClonedPrior(AroundInitial):
-    """An initial belief whose state also holds the velocities of past steps, all equal to the present ones.
+    """Augments an initial belief by velocities of past steps, all equal to the present ones.
 
     Args:
         initial: writes an ensemble ``[*B, E, 5]``, or a mean ``[*B, 5]`` and a covariance ``[*B, 5, 5]``, of
@@ -160,7 +159,7 @@ class ClonedPrior(AroundInitial):
     """
 
     place = "initial"
-    derived = Initial.derived  # the module inside knows entries of another size
+    derived = Initial.derived  # entries of the wrapped module have another size
 
     def __init__(self, initial: TensorDictModuleBase, lags: int):
         check_count("lags", lags)
@@ -182,12 +181,13 @@ class ClonedPrior(AroundInitial):
 
 
 class ClonedTransition(Wrapper, Transition):
-    """A transition whose state also holds the velocities of past steps, the latest first: they move on by one.
+    """Augments a transition by the velocities of past steps, the latest first, and shifts them by one.
 
     Args:
         transition: forecasts ensembles ``[*B, E, 5]``, see :class:`torch_denkf.applications.car.UnicycleTransition`;
             its keys are kept.
-        history_key: where ``transition`` reads the velocities of the past steps, if it does, the present ones first.
+        history_key: key from which ``transition`` reads the velocities of past steps, the present ones first, if it
+            does.
 
     Example:
         >>> from tensordict import TensorDict

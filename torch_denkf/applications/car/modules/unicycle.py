@@ -1,4 +1,4 @@
-r"""A vehicle whose pose follows from its velocities: the motion is known, their change is learned (section IV-A)."""
+r"""Unicycle model of a vehicle: known motion of the pose, learned change of the velocities (section IV-A)."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ class UnicycleTransition(MemberNetwork, Transition):
         y_t &= y_{t-1} + v_t \Delta t \sin(\theta_{t-1} + \dot\theta_t \Delta t / 2) \\
         \theta_t &= \theta_{t-1} + \dot\theta_t \Delta t
 
-    The pose moves with the *new* velocities, because those are what the image pair (t-1, t) measures: their
-    innovation then corrects the pose through the ensemble's covariance.
+    The pose moves with the *new* velocities, which the image pair (t-1, t) measures: their innovation then corrects the
+    pose through the ensemble's covariance.
 
     Args:
         velocity: maps standardised ``[*, 2]`` velocities to the standardised change ``[*, 2]``.
         dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
         loc: mean of (v, theta_dot), in m/s and rad/s.
         scale: standard deviation of (v, theta_dot), in m/s and rad/s.
-        drift: False takes the ensemble's mean change away: the velocities walk at random, with learned steps, and a
-            network trained on few drives cannot make them return to those drives' usual ones where nothing is observed.
+        drift: False removes the ensemble's mean change: the velocities are a random walk with learned steps, and do not
+            regress to the mean velocities of the training drives without observations.
         history_key: velocities of past steps ``[*B, E, L, 2]``, see
-            :func:`torch_denkf.applications.car.modules.pairs.with_history`, L at least 2. With them the velocities go
-            on changing as they last did, by a learned share :math:`\rho` of that (Gardner's damped trend): a random
-            walk lags behind a car that brakes.
+            :func:`torch_denkf.applications.car.modules.pairs.with_history`, L at least 2. The last change of the
+            velocities is then extrapolated with a learned factor :math:`\rho` (Gardner's damped trend), as a random
+            walk lags behind a braking car.
         in_key: ensemble ``[*B, E, 5]`` of [x m, y m, theta rad, v m/s, theta_dot rad/s].
         out_key: forecast ensemble ``[*B, E, 5]``.
 
@@ -97,31 +97,30 @@ class UnicycleTransition(MemberNetwork, Transition):
 
 
 class UnicycleMotion(SubModel):
-    r"""Moves the pose of the last belief with the velocities of the analysis, put *after* an :class:`EnsembleAnalysis`.
+    r"""Moves the pose of the last belief with the analysed velocities; put it *after* an :class:`EnsembleAnalysis`.
 
     The analysis of an ensemble corrects the pose through sample correlations. Over a long drive the members' poses
-    spread over many metres, and a spurious correlation of :math:`1/\sqrt{E}` between them and the velocity's
-    innovation makes the mean pose jump. This module takes from the analysis the velocities alone and lets the known
-    motion carry each member's pose, which is localisation in the state: an innovation of the velocities at t acts on
-    the step from t-1 to t. After a :class:`PairObservation` it acts on all steps between the two frames; with
-    ``smooth`` on all steps of the history, whatever the sensor has read: a turn that shows late, because readings are
-    noisy, is then in the path where it was.
+    spread over many metres, and a spurious correlation of :math:`1/\sqrt{E}` between them and the velocity's innovation
+    makes the mean pose jump. This module uses only the velocities of the analysis, and moves each member's pose by the
+    known motion, which is localisation in the state: an innovation of the velocities at t acts on the step from t-1 to
+    t. After a :class:`PairObservation` it acts on all steps between the two frames; with ``smooth`` on all steps of the
+    history, so that a turn that noisy readings reveal late is put at the right place of the path.
 
     Use with ``EnsembleAnalysis(..., belief_prefix="analysis")``, and not with ``update_at_reset``.
 
     Args:
-        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step; a number
-            with a history, whose steps must all be alike.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step; with a
+            history it must be a number, as all steps must be equal.
         before_key: ensemble of the belief at t-1, ``[*B, E, 5]``, see :class:`UnicycleTransition`.
         analysis_key: ensemble of the analysis at t, ``[*B, E, 5]``, with a history ``[*B, E, 5 + 2L]``.
-        belief_prefix: prefix of what is written: ``ensemble`` ``[*B, E, 5]``, ``mean`` and ``var`` ``[*B, 5]``.
+        belief_prefix: prefix of the outputs: ``ensemble`` ``[*B, E, 5]``, ``mean`` and ``var`` ``[*B, 5]``.
         history_key: velocities of the past steps ``[*B, E, L, 2]``, see :func:`with_history`; ``None`` for none.
         steps_key: optional, with a history: see :class:`PairObservation`.
-        smooth: correct the path by each analysis of the history, as a fixed-lag smoother does. The first L innovations
-            move the first pose along with it, by a share of the doubt about the first velocity.
+        smooth: correct the path by each analysis of the history, like a fixed-lag smoother. The first L innovations
+            also correct the first pose, in proportion to the uncertainty of the first velocity.
 
     Raises:
-        ValueError: if it is to smooth without a history.
+        ValueError: if ``smooth`` is True without a history.
 
     Source:
         Evensen & van Leeuwen 2000, "An ensemble Kalman smoother for nonlinear dynamics".
@@ -168,11 +167,11 @@ class UnicycleMotion(SubModel):
             analysed = analysis[..., 5:].unflatten(-1, (-1, 2))
             corrected = torch.where(past, analysed, history)
             moved = pose
-            for step in history.unbind(-2):  # back to where the history begins
+            for step in history.unbind(-2):  # back to the start of the history
                 moved = unicycle_move(moved, step, -dt)
             for step in reversed(corrected.unbind(-2)):
                 moved = unicycle_move(moved, step, dt)
-            # Where the pair is of neighbours nothing moves, not even by rounding.
+            # Pairs of neighbours keep the pose exactly, without rounding.
             pose = torch.where(past.flatten(-2).any(-1, keepdim=True), moved, pose)
             histories = (torch.cat([velocity.unsqueeze(-2), analysed[..., :-1, :]], -2),)
         ensemble = torch.cat([unicycle_move(pose, velocity, dt), velocity], -1)

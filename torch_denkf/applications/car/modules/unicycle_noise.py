@@ -1,4 +1,4 @@
-"""Noise of a vehicle's velocities, which moves its pose in the same step."""
+"""Process noise of a unicycle: the noise of the velocities also moves the pose of the same step."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ __all__ = ["UnicycleNoise"]
 
 
 class UnicycleNoise(NoiseThrough):
-    r"""Noise of the velocities of a vehicle, which moves its pose in the same step.
+    r"""Computes process noise of a unicycle in which the noise of the velocities also moves the pose of the same step.
 
-    :class:`~torch_denkf.applications.car.UnicycleTransition` moves the pose with the *new* velocities, and an
-    ensemble's noise is in those. A covariance that is added to the velocities *after* the motion would leave the pose
-    of that step uncorrelated with them, and an innovation of the velocities would not correct it. Here :math:`Q = G Q_v
-    G^T` with :math:`G = \partial (x, y, \theta, v, \dot\theta)_t / \partial (v, \dot\theta)_t`.
+    :class:`~torch_denkf.applications.car.UnicycleTransition` moves the pose with the *new* velocities, which have the
+    noise. Noise that is added to the velocities *after* the motion would be uncorrelated with the pose of that step,
+    and an innovation of the velocities would not correct the pose. Here :math:`Q = G Q_v G^T` with :math:`G = \partial
+    (x, y, \theta, v, \dot\theta)_t / \partial (v, \dot\theta)_t`.
 
     Args:
         noise: writes variances ``[*B, 2]`` or a covariance ``[*B, 2, 2]`` of (v, theta_dot), in (m/s)^2 and
-            (rad/s)^2; its keys are kept. In a filter it may read ``("belief", "mean")``.
-        dt: time step in seconds, or the key of an entry ``[*B, 1]``, as of the transition.
+            (rad/s)^2; its keys are kept. In a filter this module may read ``("belief", "mean")``.
+        dt: time step in seconds, or the key of an entry ``[*B, 1]``; the same as for the transition.
         mean_key: mean at t-1, ``[*B, S]``, starting with [x, y, theta, v, theta_dot]; further dimensions, such as
             clones, get no noise.
-        forecast_mean_key: mean of the forecast, ``[*B, S]``; the filter puts it there.
+        forecast_mean_key: mean of the forecast, ``[*B, S]``, which the filter writes.
 
     Raises:
         ValueError: if the noise does not have two dimensions.

@@ -1,4 +1,4 @@
-"""A vehicle's pose from velocities that a network estimates."""
+"""Integrates a network's velocity estimates to a vehicle's pose."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["UnicyclePose"]
 
 
 class UnicyclePose(SubModel):
-    r"""A vehicle's pose from estimated velocities: the known motion is not left for a network to learn.
+    r"""Integrates estimated velocities to a vehicle's pose by the known motion, which need not be learned.
 
     .. math::
         p_t = f(p_{t-1}, u_t), \qquad
@@ -22,15 +22,15 @@ class UnicyclePose(SubModel):
         \mathrm{Cov}(p_t, u_t) = G \Sigma_t
 
     with the motion f of :class:`UnicycleTransition`, its Jacobians F and G, and velocities :math:`u_t \sim N(\mu_t,
-    \Sigma_t)`. To first order, and as if errors of the velocities at different times were independent: where they are
-    not (a biased network), the pose is less certain than this says.
+    \Sigma_t)`. The covariance is of first order, for independent errors of the velocities at different times: with
+    correlated errors (a biased network) it is too small.
 
     Args:
         dt: time step in seconds, or the key of an entry ``[*B, 1]`` with the seconds since the last step.
         velocity_prefix: prefix of ``mean`` ``[*B, 2]`` and ``cov`` ``[*B, 2, 2]`` of (v m/s, theta_dot rad/s) at t.
         forecast_prefix: prefix of ``mean`` ``[*B, 5]`` and ``cov`` of [x m, y m, theta rad, v, theta_dot] at t-1, as
-            :class:`LSTMTransition` hands them on.
-        belief_prefix: prefix of ``mean``, ``cov`` and ``var`` at t, written.
+            :class:`LSTMTransition` writes them.
+        belief_prefix: prefix of the outputs ``mean``, ``cov`` and ``var`` at t.
 
     Example:
         >>> from tensordict import TensorDict

@@ -1,1 +1,1 @@
-"""A car's motion from its camera: the filter, its training, tracking a drive, failures of the camera, scores."""
+"""Visual odometry of a car: filter, training, tracking of a drive, camera failures, scores."""

@@ -15,16 +15,16 @@ from torch_denkf.applications.car.odometry.streams import Drive, mirror, rows, t
 
 __all__ = ["PairSampler", "ReadingSampler", "mark_start"]
 
-_GROUPS = 8  # drives in a batch of the sensor, windows in one of the whole filter
+_GROUPS = 8  # drives per batch for the sensor, windows per batch for the whole filter
 
 
 class PairSampler:
-    """Draws pairs of frames, or windows, of drives themselves: for training that involves the sensor.
+    """Draws pairs of frames, or windows, of drives, for training with the sensor.
 
     Args:
-        drives: that are drawn from, by their weights.
-        data: of each, ``[N]``.
-        longest: steps between the two frames of a pair, at most.
+        drives: drives to draw from, by their weights.
+        data: frames of each drive, ``[N]``.
+        longest: largest number of steps between the two frames of a pair.
     """
 
     def __init__(self, drives: Sequence[Drive], data: Sequence[TensorDict], longest: int):
@@ -33,7 +33,7 @@ class PairSampler:
         self.neighbours = torch.tensor([drive.steps == 1 for drive in drives])
 
     def frames(self, generator: torch.Generator, batch: int = 64) -> TensorDict:
-        """Returns frames ``[batch]``, every second group of them mirrored."""
+        """Returns frames ``[batch]``; every second group is mirrored."""
         chosen: list[TensorDict] = []
         for number in torch.multinomial(self.weight, _GROUPS, replacement=True, generator=generator).tolist():
             data = self.data[number]
@@ -43,7 +43,7 @@ class PairSampler:
         return TensorDict.cat(chosen)
 
     def windows(self, generator: torch.Generator, length: int | None, start_std: Tensor) -> TensorDict:
-        """Returns windows ``[8, length]`` that start from a wrong velocity."""
+        """Returns windows ``[8, length]`` with a noisy initial state."""
         weight = self.weight * self.neighbours
         chosen: list[TensorDict] = []
         for number in torch.multinomial(weight, _GROUPS, replacement=True, generator=generator).tolist():
@@ -60,14 +60,14 @@ class ReadingSampler:
     """Draws windows of a frozen sensor's readings.
 
     Args:
-        readings: of each drive, ``[N]``, see :func:`torch_denkf.applications.car.odometry.streams.read_spans`.
-        weights: shares of the batches.
+        readings: readings of each drive, ``[N]``, see :func:`torch_denkf.applications.car.odometry.streams.read_spans`.
+        weights: shares of the drives in the batches.
         length: steps of a window.
-        gain_error: standard deviation of the logarithm of a factor on all speeds that a window's sensor reads: cameras
-            are mounted a little higher or lower, or look a little further up, and the sensor cannot know.
+        gain_error: standard deviation of the logarithm of a gain on all speeds of a window, for unknown errors of the
+            camera's height and pitch.
 
     Raises:
-        ValueError: if no drive is as long as a window.
+        ValueError: if all drives are shorter than a window.
     """
 
     def __init__(self, readings: Sequence[TensorDict], weights: Sequence[float], length: int, gain_error: float):
@@ -88,10 +88,10 @@ class ReadingSampler:
         self.starts, self.weight = torch.cat(starts), torch.cat(weight)
 
     def windows(self, generator: torch.Generator, start_std: Tensor, batch: int = 48) -> TensorDict:
-        """Resamples windows ``[batch, length]`` to be faster or slower, and drops up to half of the frames."""
+        """Draws windows ``[batch, length]``, scales their speeds, and drops up to half of the frames."""
         start = self.starts[torch.multinomial(self.weight, batch, replacement=True, generator=generator)]
         windows = self.readings[start.unsqueeze(-1) + torch.arange(self.length)]
-        # Few drives have few speeds, and the transition would learn to return to those.
+        # Few drives have few speeds, to which the transition would learn to regress.
         low, high = torch.tensor([-1.0, -0.7]), torch.tensor([0.7, 0.7])
         speed = (low + (high - low) * torch.rand(batch, 1, 2, generator=generator)).exp()
         gain = (self.gain_error * torch.tensor([1.0, 0.3]) * torch.randn(batch, 1, 2, generator=generator)).exp()
@@ -105,6 +105,6 @@ class ReadingSampler:
 
 
 def with_start(windows: TensorDict, start_std: Tensor, generator: torch.Generator) -> TensorDict:
-    """Returns windows that begin at a wrong velocity: a filter that begins at the truth learns to hold on to it."""
+    """Adds noise to the start of windows, so that the filter does not learn to trust its forecast only."""
     windows["start"] = windows["state"] + start_std * torch.randn(len(windows), 1, 5, generator=generator)
     return mark_start(windows)

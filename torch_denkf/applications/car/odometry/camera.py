@@ -1,4 +1,4 @@
-"""The camera of a car: its images at the training's resolution, their motion, and whether all of that makes sense."""
+"""Camera of a car: scales images to the training's resolution, computes their optical flow, and checks plausibility."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from torch_denkf.applications.car.vision.signs import static_region
 
 __all__ = ["CarCamera", "check_frame"]
 
-_WATCHED = 40  # moving pairs on which camera and calibration are judged
-_MOVING = 0.012  # mean flow, in tangents: a car that stands tells nothing
-_LEAST_CORRELATION = 0.95  # of the road, median; 0.97 to 0.99 on KITTI, 0.94 and less with images that do not fit
+_WATCHED = 40  # number of moving pairs for the checks of camera and calibration
+_MOVING = 0.012  # mean flow, in tangents, below which the car counts as standing
+_LEAST_CORRELATION = 0.95  # of the road, median; 0.97 to 0.99 on KITTI, 0.94 and less with a wrong calibration
 _LEAST_VIEW = 0.85  # share of the field of view that the sensor was trained with
-_FASTEST = 3.0  # m a pair, where the sensor's range ends
+_FASTEST = 3.0  # m per frame pair: range of the sensor
 _PITCH_MARGIN = 0.01  # rad
 
 
 def check_frame(frame: object, number: int) -> None:
-    """Raises unless this is an image as OpenCV has it.
+    """Checks that a frame is an image in OpenCV's layout.
 
     Raises:
-        ValueError: if it is no array, or one of another shape or dtype; names the frame.
+        ValueError: if it is no array, or has another shape or dtype; the message names the frame.
     """
     if not isinstance(frame, np.ndarray):
         raise ValueError(f"frame {number} is a {type(frame).__name__}; pass an array, uint8 [H, W] or [H, W, 3]")
@@ -42,16 +42,16 @@ def check_frame(frame: object, number: int) -> None:
 
 
 class CarCamera:
-    """Reduces images to the training's resolution, reads their motion, and warns where that makes no sense.
+    """Scales images to the training's resolution, computes their motion, and warns if it is implausible.
 
     Args:
         frame: the first image, ``[H, W]`` or ``[H, W, 3]``.
         calibration: (fx, fy, cx, cy) in pixels.
-        height: over the road, in m.
-        pitch: how far the camera looks up from the road, in rad.
+        height: height over the road, in m.
+        pitch: upward pitch of the camera relative to the road, in rad.
         focal: focal length of the training images in pixels; ``None`` leaves images as they are.
         two_view: whether corners are tracked, too.
-        repair: whether the flow is continued over what stands still.
+        repair: whether the flow is continued over static occlusions.
 
     Raises:
         ValueError: if the principal point does not belong to images of this size.
@@ -81,7 +81,7 @@ class CarCamera:
         self.calibration = [fx * across, fy * down, (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5]
         self.calibration[3] += pitch * self.calibration[1]
         self.height, self.two_view, self.repair, self.watch = height, two_view, repair, _Watch(pitch)
-        # What the sensor looks at, against what the camera shows: to the sides and down to the near road.
+        # The sensor's field of view against the camera's: to the sides, and down to the near road.
         canonical = CanonicalCamera(240.0)
         wanted = [side / 2 / canonical.focal for side in (canonical.width, canonical.height)]
         shown = [min(cx, columns - cx) / fx, (rows - cy) / fy]
@@ -101,9 +101,9 @@ class CarCamera:
         return grey if self.size == grey.shape[::-1] else cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
 
     def motion(self, previous: np.ndarray, current: np.ndarray) -> tuple[dict[str, Tensor], float]:
-        """Returns flow and road of a pair, rounded as for the training; and how corners moved, where they are tracked.
+        """Returns flow, road correlation and corner motion (if tracked) of a pair, rounded as in the training.
 
-        Next to it the share of the picture that stands still.
+        It also returns the static share of the image.
         """
         static = static_region(previous, current)
         hidden = {"hidden": static} if self.repair and static.any() else {}
@@ -117,14 +117,14 @@ class CarCamera:
 
 
 class _Watch:
-    """Warns, once each, where the readings contradict the given calibration."""
+    """Warns once for each contradiction between readings and calibration."""
 
     def __init__(self, pitch: float):
         self.pitch, self.said = pitch, False
         self.seen: deque[tuple[float, float, float]] = deque(maxlen=_WATCHED)
 
     def __call__(self, flow: Tensor, road: Tensor) -> None:
-        """Looks at one pair."""
+        """Checks one pair."""
         if self.said:
             return
         if float(flow[:2].norm(dim=0).mean()) < _MOVING:
@@ -155,6 +155,6 @@ class _Watch:
             )
 
     def say(self, text: str) -> None:
-        """Warns, and then no more."""
+        """Warns once."""
         self.said = True
         warnings.warn(text, UserWarning, stacklevel=6)

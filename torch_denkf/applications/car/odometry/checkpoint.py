@@ -1,4 +1,4 @@
-"""A trained car filter from a folder that no other robot's filter may lie in."""
+"""Loads a trained car filter from a folder."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["load_car_filter"]
 
 
 def load_car_filter(folder: str | Path) -> CarFilter:
-    """Reads a filter that :func:`torch_denkf.pretrained.save_pretrained` wrote. Nothing in the files is executed.
+    """Loads a filter from a folder of :func:`torch_denkf.pretrained.save_pretrained`. Nothing in the files is executed.
 
     Raises:
-        FileNotFoundError: if there is none in the folder.
-        ValueError: if a file is damaged, is another one's, or of another robot.
+        FileNotFoundError: if the folder has no filter.
+        ValueError: if a file is damaged, belongs to another filter, or to another robot.
     """
     return load_folder(folder, {CarFilter.builder: car_filter})  # type: ignore[return-value]

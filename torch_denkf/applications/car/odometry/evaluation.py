@@ -1,4 +1,4 @@
-"""Errors of a car filter on drives with known poses, next to dead reckoning on the same readings."""
+"""Errors of a car filter on drives with known poses, compared with dead reckoning on the same readings."""
 
 from __future__ import annotations
 
@@ -59,22 +59,22 @@ def evaluate_car_filter(
 ) -> tuple[list[dict[str, Any]], dict[str, TensorDict]]:
     """Runs a filter on whole drives and compares its path with the true one.
 
-    Each run begins at the true pose with the velocities that the sensor reads first. Errors move with the filter's own
-    noise, so they are means over several draws of it (and of the frames that are missing).
+    Each run begins at the true pose with the sensor's first reading of the velocities. Errors are means over several
+    draws of the filter's noise (and of the missing frames).
 
     ============================ ======================================================================================
     entry of a row               content
     ============================ ======================================================================================
     ``drive``, ``method``        ``"filter"``, ``"dead reckoning"`` (the sensor's mean readings, integrated), or
                                  ``"floor"`` (the true velocities, integrated)
-    ``frames``, ``window``       of the drive; steps of the end point errors
-    ``translation_m_per_m``      end point error, as ``metrics.odometry.kitti_endpoint_error`` computes it
-    ``rotation_deg_per_m``       its rotation
+    ``frames``, ``window``       number of frames; steps of the end point errors
+    ``translation_m_per_m``      end point error, see ``metrics.odometry.kitti_endpoint_error``
+    ``rotation_deg_per_m``       heading error at the end points
     ``devkit_t_rel_percent``,    of the planar path, as ``metrics.devkit.kitti_devkit_error`` computes it; left
     ``devkit_r_rel_deg_per_m``   out below 100 m
     ``coverage90_v``,            share of the true speeds, and of the true turn rates, in the filter's 90 % intervals
     ``coverage90_theta_dot``
-    ``blind``                    share of the frames that the sensor could not compare with one before
+    ``blind``                    share of the frames without a frame pair
     ============================ ======================================================================================
 
     Args:
@@ -83,22 +83,22 @@ def evaluate_car_filter(
         drives: names of drives.
         cache: folder for the flow; ``True`` for the library's.
         camera: folder of the images; by default the first that has any.
-        size: (H, W) that the images are scaled to; by default that of the training.
-        height: of the camera over the road, in m.
-        pitch: how far the camera looks up, in rad; see :func:`torch_denkf.applications.car.track`.
-        missing: share of the frames to lose.
-        draws: of the noise.
-        window: steps of the end point errors; the whole drive where it is shorter.
-        seed: of the noise.
-        progress: whether a bar is shown.
+        size: (H, W) of the scaled images; by default that of the training.
+        height: height of the camera over the road, in m.
+        pitch: upward pitch of the camera, in rad; see :func:`torch_denkf.applications.car.track`.
+        missing: share of the frames to drop.
+        draws: number of draws of the noise.
+        window: steps of the end point errors; the whole drive if it is shorter.
+        seed: seed of the noise.
+        progress: whether to show a progress bar.
 
     Returns:
-        Rows, a dictionary for each drive and method; and by drive the filter's beliefs of the first draw, ``[N]``.
+        Rows, a dictionary for each drive and method; and the filter's beliefs of the first draw by drive, ``[N]``.
 
     Raises:
-        FileNotFoundError: if a drive is not there.
-        ValueError: if a share, a number of draws, a window or the pitch is out of range, or a drive's frame time is not
-            that of the filter.
+        FileNotFoundError: if a drive does not exist.
+        ValueError: if a share, a number of draws, a window or the pitch is out of range, or a drive's frame time
+            differs from the filter's step.
     """
     if not 0 <= missing < 1 or draws < 1 or window < 1:
         raise ValueError(f"missing is in [0, 1), draws and window at least 1; got {missing}, {draws} and {window}")
@@ -172,9 +172,9 @@ def path_errors(path: Tensor, truth: Tensor, window: int) -> dict[str, float]:
 
 
 def _held(reading: TensorDict, car: CarFilter) -> Tensor:
-    """Returns the sensor's mean velocities ``[N, 2]``; where it is blind the last ones, at the start the first ones.
+    """Returns the sensor's mean velocities ``[N, 2]`` with a zero-order hold over rows without a reading.
 
-    A pair over a gap gives the mean over its steps, unless it is farther apart than the sensor can read.
+    A pair over a gap gives the mean over its steps, unless the motion exceeds the sensor's range.
     """
     mean, steps = reading["sensor", "ensemble"].mean(1), reading["steps"].squeeze(-1).tolist()
     held, path = first_state(reading)[VELOCITIES], []
@@ -208,7 +208,7 @@ def _line(title: str, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def write_rows(rows: Sequence[dict[str, Any]], file: str | Path) -> None:
-    """Writes rows of :func:`evaluate_car_filter` as CSV, with ``COLUMNS``; what a row lacks stays empty."""
+    """Writes rows of :func:`evaluate_car_filter` as CSV, with ``COLUMNS``; missing values are empty."""
     with replacing(file) as beside, beside.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()

@@ -1,4 +1,4 @@
-"""A drive with known poses, tracked while its camera fails: belief, truth and dead reckoning side by side."""
+"""Tracks a drive with known poses during camera failures: belief, ground truth and dead reckoning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["drive_scores", "track_failing_drive", "usual_failures"]
 
 
 def usual_failures(frames: int) -> list[CameraFailure]:
-    """Returns a missing stretch, a black one and one with a box, of a drive of so many frames.
+    """Returns the failures of the demo: a span of missing frames, one of black frames and one with a box.
 
     Example:
         >>> [(failure.kind, failure.first, failure.last) for failure in usual_failures(100)]
@@ -48,19 +48,19 @@ def track_failing_drive(
 
     Args:
         car: the filter.
-        drive: with ``"image"``, ``"state"``, ``"calibration"`` and ``"dt"``, see
+        drive: drive with ``"image"``, ``"state"``, ``"calibration"`` and ``"dt"``, see
             :func:`torch_denkf.applications.car.read_kitti_drive`.
-        failures: what happens when.
-        height: of the camera over the road, in m.
+        failures: failures of the camera.
+        height: height of the camera over the road, in m.
         black_level: see :func:`torch_denkf.applications.car.track`.
-        repair: likewise.
-        seed: of the filter's noise.
+        repair: see there, too.
+        seed: seed of the filter's noise.
         progress: called with the number of frames since the last call.
 
     Returns:
-        ``[T]``: ``"belief"``; ``"state"`` ``[T, 5]``, the truth as seen from the first pose; ``"dead_reckoning"``
-        ``[T, 3]``, the path of the sensor's readings, of which the last is held where there is none; ``"observed"``
-        ``[T, 1]``; ``"time"`` ``[T, 1]`` in s.
+        ``[T]``: ``"belief"``; ``"state"`` ``[T, 5]``, the ground truth relative to the first pose; ``"dead_reckoning"``
+        ``[T, 3]``, the integrated readings with a zero-order hold; ``"observed"`` ``[T, 1]``; ``"time"`` ``[T, 1]`` in
+        s.
 
     Raises:
         ValueError: if the drive does not fit the filter, see :func:`torch_denkf.applications.car.track`.
@@ -114,9 +114,9 @@ def drive_scores(tracked: TensorDict, level: float = 0.9) -> dict[str, float]:
     """Returns the scores of a result of :func:`track_failing_drive`.
 
     Returns:
-        ``way_m``; ``filter_end_m`` and ``reckoned_end_m``, distances from the truth at the end, and ``filter_mean_m``
-        and ``reckoned_mean_m``, those over all frames; ``held_v`` and ``held_theta_dot``, shares of the true velocities
-        in the filter's intervals.
+        ``way_m``, the distance travelled; ``filter_end_m`` and ``reckoned_end_m``, position errors at the end, and
+        ``filter_mean_m`` and ``reckoned_mean_m``, their means over all frames; ``held_v`` and ``held_theta_dot``, the
+        coverage of the filter's intervals of the velocities.
     """
     truth, mean, var = tracked["state"], tracked["belief", "mean"], tracked["belief", "var"]
     errors = {
@@ -145,7 +145,7 @@ def _counted(frames, progress):
 
 
 def _from_first_pose(state: Tensor) -> Tensor:
-    """Returns states as seen from the first of them."""
+    """Returns states relative to the first pose."""
     state = state.double()
     x, y = (state[:, :2] - state[0, :2]).unbind(-1)
     cos, sin = state[0, 2].cos(), state[0, 2].sin()

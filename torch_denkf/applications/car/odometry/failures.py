@@ -1,4 +1,4 @@
-"""Cameras that fail, with and without saying so: frames that do not arrive, are black, or are hidden in part."""
+"""Camera failures, announced and unannounced: missing frames, black frames, partial occlusion."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["CameraFailure", "fail_frames"]
 
 
 class CameraFailure(NamedTuple):
-    """Failure of the camera over a stretch of frames.
+    """Failure of the camera over a span of frames.
 
     Attributes:
-        kind: ``"missing"`` (the frames do not arrive, and that is known), ``"black"`` (they arrive, black) or
-            ``"box"`` (:class:`torch_denkf.envs.OccludingBox`: something hides a part of each picture).
+        kind: ``"missing"`` (the frames are known to be missing), ``"black"`` (black frames arrive) or ``"box"``
+            (:class:`torch_denkf.envs.OccludingBox` occludes a part of each image).
         first: number of the first frame.
         last: number of the last frame.
     """
@@ -39,13 +39,13 @@ def fail_frames(frames: Iterable[np.ndarray | None], failures: Sequence[CameraFa
 
     Args:
         frames: images ``[H, W]`` or ``[H, W, 3]``, uint8; ``None`` for one that is missing.
-        failures: what happens when; of two at a time the first.
+        failures: failures; of overlapping ones the first counts.
 
     Yields:
-        The images; ``None`` where one is missing. Those that are changed are copies.
+        The images; ``None`` for a missing one. Changed images are copies.
 
     Raises:
-        ValueError: for a kind of failure that is not known.
+        ValueError: for an unknown kind of failure.
 
     Example:
         >>> failures = [CameraFailure("missing", 1, 1), CameraFailure("black", 2, 3)]

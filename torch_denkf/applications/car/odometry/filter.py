@@ -23,28 +23,29 @@ __all__ = ["CarFilter", "CarSettings", "VELOCITIES", "car_filter"]
 
 VELOCITIES = [3, 4]  # dimensions of v and theta_dot in [x, y, theta, v, theta_dot]
 _HISTORY = ("belief", "history")  # velocities of the past steps
-_UNITS = (0.1, 0.03)  # errors that a good sensor leaves, in standard deviations of (v, theta_dot)
-_START = 0.2  # doubt about the first velocities, likewise
+_UNITS = (0.1, 0.03)  # errors of a good sensor, in standard deviations of (v, theta_dot)
+_START = 0.2  # uncertainty of the first velocities, in the same unit
 
 
 @dataclass(frozen=True)
 class CarSettings:
-    """All numbers that a :class:`CarFilter` is built from.
+    """Settings of a :class:`CarFilter`.
 
     Attributes:
         dt: time between two frames, in s.
         velocity_mean: mean of (v m/s, theta_dot rad/s) over the training drives.
-        velocity_std: standard deviation of (v m/s, theta_dot rad/s) over them.
+        velocity_std: standard deviation of (v m/s, theta_dot rad/s) over the training drives.
         ensemble_size: members, E.
-        lags: past steps that an innovation still corrects.
-        longest: steps between two frames that the sensor may compare, where those between them are missing.
-        reach: largest distance between the two frames of a pair that the sensor can read, in m.
-        features: of the sensor's code of the flow.
+        lags: number of past steps that an innovation corrects.
+        longest: largest number of steps between the frames of a pair, after missing frames.
+        reach: largest distance travelled between the two frames of a pair in the sensor's range, in m.
+        features: size of the sensor's code of the flow.
         num_cells: hidden layers of the sensor's head.
         two_view: whether the sensor reads tracked corners, too (``"two_view"``, see
             :func:`torch_denkf.applications.car.vision.epipolar.two_view_motion`).
-        size: (H, W) that drives are scaled to.
-        focal: focal length of the training images, in pixels; larger images are reduced to it. ``None`` for any.
+        size: (H, W) of the scaled images.
+        focal: focal length of the training images, in pixels; images with a longer one are scaled down to it. ``None``
+            for any.
         inflation: factor on the belief's spread in each step, chosen on validation drives.
     """
 
@@ -83,15 +84,15 @@ class CarSettings:
 
     @property
     def start_std(self) -> Tensor:
-        """Returns the standard deviation of the first state ``[5]``: a given pose, velocities of the first reading."""
+        """Returns the standard deviation of the first state ``[5]``: zero for the pose, positive for the velocities."""
         return torch.cat([torch.zeros(3), _START * torch.tensor(self.velocity_std)])
 
 
 def velocity_analysis(lags: int) -> EnsembleAnalysis:
-    """Returns the update of a car's velocities, and those of the last ``lags`` steps, by readings of frame pairs.
+    """Returns the analysis of a car's velocities, and those of the last ``lags`` steps, by readings of frame pairs.
 
-    Errors of speed and of turn rate have nothing to do with each other; few members would see correlations. Inflation
-    multiplies the present velocities alone: those of past steps would be multiplied again in each step.
+    A taper removes spurious correlations between speed and turn rate. Inflation acts only on the present velocities, as
+    those of past steps would be inflated again in each step.
     """
     own = torch.cat([torch.zeros(3, 2), torch.eye(2).repeat(1 + lags, 1)])
     return EnsembleAnalysis(
@@ -108,15 +109,15 @@ class CarFilter(Filter):
     """A DEnKF for a car with one camera, built by :func:`car_filter`.
 
     It reads ``"flow"`` and ``"road"``, with the setting ``two_view`` also ``"two_view"`` (see
-    :func:`torch_denkf.applications.car.with_motion`), ``"observed"`` and ``"steps"``, and
-    where an episode begins ``"start"`` ``[*B, 5]``: the first state. The state is [x m forward, y m to the left,
-    theta rad to the left, v m/s, theta_dot rad/s].
+    :func:`torch_denkf.applications.car.with_motion`), ``"observed"`` and ``"steps"``, and at the beginning of an
+    episode ``"start"`` ``[*B, 5]``, the first state. The state is [x m forward, y m to the left, theta rad to the left,
+    v m/s, theta_dot rad/s].
 
     Args:
         settings: sizes and constants.
 
     Attributes:
-        builder: name of the function that builds it, in a saved folder.
+        builder: name of its builder function in a saved folder.
     """
 
     builder = "car"
@@ -146,7 +147,7 @@ class CarFilter(Filter):
                 drift=False,
             ),
             observation=PairObservation([s.reach / s.dt, torch.inf]),
-            # Most of the sensor's error stays for a whole drive: each member predicts by its own calibration.
+            # Most of the sensor's error is constant over a drive: each member has a constant gain.
             gain=MemberGain([0.05, 0.02], ensemble_size=s.ensemble_size, in_key=("forecast", "observation")),
             analysis=TensorDictSequential(analysis, UnicycleMotion(s.dt, history_key=_HISTORY, smooth=True)),
         )
@@ -156,12 +157,12 @@ class CarFilter(Filter):
 
     @property
     def settings(self) -> CarSettings:
-        """Returns all numbers that it is built from, with the inflation as it is now."""
+        """Returns the settings, with the present inflation."""
         return replace(self._settings, inflation=self.inflation)
 
     @property
     def sensor(self) -> FlowSensor:
-        """Reads the velocities from flow and road; can be trained and run alone."""
+        """Returns the sensor of velocities from flow and road, which can be trained and run alone."""
         return self["sensor"]
 
     @property
@@ -178,7 +179,7 @@ class CarFilter(Filter):
         return next(module for module in self.modules() if isinstance(module, EnsembleAnalysis))
 
     def without_sensor(self) -> Filter:
-        """Returns this filter for precomputed readings of its sensor: it shares all parameters but the sensor's."""
+        """Returns this filter without its sensor, for precomputed readings; parameters are shared."""
         names = [name for name in self.module if name != "sensor"]
         return Filter(OrderedDict((name, self[name]) for name in names), initial=self.initial)
 
@@ -192,14 +193,14 @@ def car_filter(settings: CarSettings | None = None, **changes) -> CarFilter:
 
     Args:
         settings: sizes and constants; the defaults are those of the KITTI study's DEnKF.
-        **changes: single settings, in the place of those.
+        **changes: single settings to replace.
 
     Returns:
-        The filter; its sensor is ``filter.sensor``, the rest of it ``filter.without_sensor()``.
+        The filter; its sensor is ``filter.sensor``, the other modules are ``filter.without_sensor()``.
 
     Raises:
-        TypeError: on a name that is no setting.
-        ValueError: on settings that are out of range.
+        TypeError: for an unknown setting.
+        ValueError: for settings out of range.
 
     Example:
         >>> car = car_filter(ensemble_size=8)

@@ -1,4 +1,4 @@
-"""Images of one's own: a folder or a video, its camera's calibration, and its frames' times."""
+"""Reads users' images from a folder or a video, the camera's calibration, and the frames' times."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 def read_camera(file: str | Path, camera: str | None = None) -> tuple[float, float, float, float]:
     r"""Reads focal lengths and principal point.
 
-    The file is KITTI's ``calib.txt`` with rows ``P0:`` to ``P3:``; or says ``fx``, ``fy``, ``cx`` and ``cy`` in JSON,
-    YAML or text (``fx: 718.9`` or ``fx = 718.9``); or holds four numbers in this order.
+    The file is KITTI's ``calib.txt`` with rows ``P0:`` to ``P3:``; or has ``fx``, ``fy``, ``cx`` and ``cy`` in JSON,
+    YAML or text (``fx: 718.9`` or ``fx = 718.9``); or four numbers in this order.
 
     Args:
         file: the file.
-        camera: of a ``calib.txt``, ``image_0`` to ``image_3``; needed where its rows differ.
+        camera: camera of a ``calib.txt``, ``image_0`` to ``image_3``; needed if its rows differ.
 
     Returns:
         (fx, fy, cx, cy) in pixels.
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: if the numbers are not there; the message names the file and what is missing.
+        ValueError: if a number is missing; the message names it and the file.
 
     Example:
         >>> import tempfile
@@ -94,7 +94,7 @@ def read_times(file: str | Path) -> list[float]:
 
     Raises:
         FileNotFoundError: without the file.
-        ValueError: naming file and line, where a row does not begin with a number.
+        ValueError: if a row does not begin with a number; the message names file and line.
     """
     file = Path(file).expanduser()
     if not file.is_file():
@@ -112,12 +112,12 @@ def read_times(file: str | Path) -> list[float]:
 
 
 class FrameSource:
-    """Frames of a folder or a video, one at a time, each time again; see :func:`read_frames`.
+    """Iterable over the frames of a folder or a video; see :func:`read_frames`.
 
     Attributes:
-        first: number of the first frame: that of its name in a folder of numbered images, else 0.
-        count: how many frames there are, those that are missing included; ``None`` where a video does not say.
-        fps: frames in a second, of a video that says so.
+        first: number of the first frame: from its name in a folder of numbered images, else 0.
+        count: number of frames, including missing ones; ``None`` if a video does not tell.
+        fps: frames per second of a video; ``None`` if unknown.
     """
 
     def __init__(self, path: Path, files: list[Path | None] | None, first: int, count: int | None, fps: float | None):
@@ -135,13 +135,13 @@ class FrameSource:
             yield image
 
     def stamps(self) -> list[float] | None:
-        """Reads when the frames of a video were taken, as the file says.
+        """Reads the time stamps of a video's frames.
 
-        All frames are decoded for it: 0.7 ms a frame of 1280 x 720 pixels.
+        This decodes all frames: 0.7 ms per frame of 1280 x 720 pixels.
 
         Returns:
-            A time in s for each frame, from the first on; of a missing frame one between its neighbours'. ``None`` of a
-            folder, and where the times do not increase.
+            A time in s for each frame, relative to the first, interpolated for missing frames. ``None`` for a folder,
+            or if the times do not increase.
         """
         if self._files is not None:
             return None
@@ -153,10 +153,10 @@ class FrameSource:
         return (np.interp(numbers, numbers[there], stamps[there]) - stamps[there][0]).tolist()
 
     def _video(self, pictures: bool = True) -> Iterator[tuple[float | None, np.ndarray | None]]:
-        """Yields times in s and, if asked for, frames; ``None`` where a frame is missing."""
+        """Yields times in s and, if requested, images; ``None`` for missing frames."""
         video = cv2.VideoCapture(name_for_c(self.path))
         try:
-            # A failed read is the end, which comes before or after the guessed count, or a damaged frame before it.
+            # A failed read is a damaged frame or the end, which may come before or after the announced count.
             expected, read, missing, there = video.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0, True
             while there or read < expected:
                 there, image = video.read() if pictures else (video.grab(), None)
@@ -180,9 +180,9 @@ class FrameSource:
 def read_frames(path: str | Path) -> FrameSource:
     """Opens a folder of images, in the order of their names, or a video.
 
-    Numbers in names count as numbers: ``frame10`` comes after ``frame9``. Where all names are numbers, as KITTI's
-    ``000018.png``, those left out are missing frames. In a video a frame that cannot be read is a missing one; at the
-    end of the video such frames are left out, and a warning says how many.
+    Names are sorted naturally: ``frame10`` comes after ``frame9``. If all names are numbers, as KITTI's ``000018.png``,
+    gaps are missing frames. In a video, frames that cannot be read are missing; at its end they are left out, and a
+    warning counts them.
 
     Args:
         path: folder of png, jpg, bmp, tif, pgm, ppm or webp files; or a video file.
@@ -192,8 +192,8 @@ def read_frames(path: str | Path) -> FrameSource:
 
     Raises:
         FileNotFoundError: if there is nothing at ``path``, or no image in the folder.
-        ValueError: if the file is not a video that OpenCV decodes, its name is no UTF-8, two images are of one frame,
-            or an image is no file, but a pipe.
+        ValueError: if the file is no video that OpenCV decodes, its name is no UTF-8, two images have the same frame
+            number, or an image is no file, but a pipe.
 
     Example:
         >>> import tempfile

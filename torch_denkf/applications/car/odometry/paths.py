@@ -1,4 +1,4 @@
-"""A tracked path as a file: mean and covariance at each frame."""
+"""Files of tracked paths: mean and covariance at each frame."""
 
 from __future__ import annotations
 
@@ -20,28 +20,27 @@ from torch_denkf.functional.moments import ensemble_cov
 __all__ = ["PATH_COLUMNS", "read_path", "write_path"]
 
 _STATE = ("x_m", "y_m", "theta_rad", "v_m_per_s", "theta_dot_rad_per_s")
-#: Of path.csv; ``std_`` are standard deviations, ``cov_xy_m2`` is the covariance of x and y; ``hidden`` is the share of
-#: the picture that stands still before the moving camera.
+#: Columns of path.csv; ``std_`` are standard deviations, ``cov_xy_m2`` is the covariance of x and y; ``hidden`` is the
+#: share of the image with a static occlusion.
 PATH_COLUMNS = ("frame", "time_s", "observed", *_STATE, *(f"std_{name}" for name in _STATE), "cov_xy_m2", "hidden")
 
 
 def write_path(beliefs: Iterable[TrackedBelief], file: str | Path) -> Iterator[TrackedBelief]:
-    """Writes beliefs to a CSV file as they come, and hands them on.
+    """Writes beliefs to a CSV file as they arrive, and yields them.
 
-    Rows are in a hidden file next to ``file`` while they come, each when its belief does. That takes the place of
-    ``file`` at the end, or when the work is broken off: what was written is there, and what was there before is not
-    lost to a full disk. What a killed process left goes when the next file is written there. Numbers have nine digits,
-    which float32 needs to be exact.
+    Rows are written at once to a temporary hidden file next to ``file``, which replaces ``file`` at the end, or on an
+    interruption: written rows are kept, and a full disk does not destroy an existing file. The temporary file of a
+    killed process is removed with the next write. Numbers have nine digits, which represent float32 exactly.
 
     Args:
         beliefs: from :func:`torch_denkf.applications.car.track`.
-        file: with a row for each belief, see ``PATH_COLUMNS``; its folder is made.
+        file: CSV file with a row for each belief, see ``PATH_COLUMNS``; its folder is created.
 
     Yields:
         The beliefs.
 
     Raises:
-        OSError: if the file cannot be written, as on a full disk; an earlier one is then as it was.
+        OSError: if the file cannot be written, as on a full disk; an existing file is then unchanged.
 
     Example:
         >>> import tempfile
@@ -79,14 +78,14 @@ def _row(belief: TrackedBelief) -> list[Any]:
 
 
 def read_path(file: str | Path) -> TensorDict:
-    """Reads what :func:`write_path` wrote.
+    """Reads a file of :func:`write_path`.
 
     Args:
         file: ``path.csv``.
 
     Returns:
-        ``[T]``, float64: ``("belief", "mean")`` and ``("belief", "var")`` ``[T, 5]``, ``("belief", "cov")``
-        ``[T, 5, 5]`` (of x and y; all else is diagonal), ``"time"`` ``[T, 1]``, ``"frame"``, ``"observed"`` and
+        ``[T]``, float64: ``("belief", "mean")`` and ``("belief", "var")`` ``[T, 5]``, ``("belief", "cov")`` ``[T, 5,
+        5]`` (of x and y; other entries are diagonal), ``"time"`` ``[T, 1]``, ``"frame"``, ``"observed"`` and
         ``"hidden"`` ``[T, 1]``.
 
     Raises:

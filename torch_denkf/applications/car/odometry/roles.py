@@ -1,4 +1,4 @@
-"""The drives that a car filter learns from, and which of them trains what."""
+"""Training drives of a car filter, and their assignment to training stages."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from torch_denkf.deployment.progress import progress_bar
 
 __all__ = ["assign_roles", "drives_by_role", "recorded_drives", "rendered_drives"]
 
-_PITCH = 0.03  # rad: rendered cameras look at most so far up or down
+_PITCH = 0.03  # rad: largest pitch of rendered cameras, up or down
 
 
 def assign_roles(names: Sequence[str]) -> dict[str, list[str]]:
-    """Assigns drives to roles: a tenth validates, a quarter trains the filter, the others train the sensor.
+    """Assigns drives to roles: a tenth for validation, a quarter for the filter, the others for the sensor.
 
     A single drive trains the filter; of two, the second trains the sensor.
 
     Args:
-        names: of drives of one kind, recorded or rendered.
+        names: names of drives of one kind, recorded or rendered.
 
     Returns:
         Names by role: ``"validation"``, ``"filter"``, ``"sensor"``.
@@ -42,17 +42,17 @@ def assign_roles(names: Sequence[str]) -> dict[str, list[str]]:
 def recorded_drives(
     root: str | Path, names: Sequence[str] | None, leave_out: Sequence[str], *, height: float, **common: Any
 ) -> list[Drive]:
-    """Drives below ``root`` that may be seen.
+    """Returns the drives below ``root`` that training may use.
 
     Args:
         root: folder in KITTI's layout.
-        names: of the drives; all by default.
-        leave_out: names of drives that must not be seen.
-        height: of their camera over the road, in m.
+        names: names of the drives; all by default.
+        leave_out: names of drives that must not be used.
+        height: height of their camera over the road, in m.
         **common: size and cache of a :class:`Drive`.
 
     Raises:
-        FileNotFoundError: if a drive that is named is not there, or none is left.
+        FileNotFoundError: if a named drive does not exist, or none is left.
     """
     there = list_kitti_drives(root)
     if unknown := [name for name in (*(names or ()), *leave_out) if name not in there]:
@@ -66,15 +66,15 @@ def recorded_drives(
 def rendered_drives(
     root: Path, count: int, *, frames: int, seed: int, processes: int | None, progress: bool, **common: Any
 ) -> list[Drive]:
-    """Renders drives with traffic; each is seen by a camera that is turned up or down a little, as another car's is.
+    """Renders drives with traffic, each with a random small pitch of the camera.
 
     Args:
-        root: folder to write to; drives that are there are kept.
-        count: how many.
-        frames: of each.
-        seed: of the drives.
-        processes: that draw at a time.
-        progress: whether a bar is shown.
+        root: folder to write to; existing drives are kept.
+        count: number of drives.
+        frames: frames per drive.
+        seed: seed of the drives.
+        processes: number of parallel processes.
+        progress: whether to show a progress bar.
         **common: size and cache of a :class:`Drive`.
     """
     if not count:

@@ -52,14 +52,14 @@ class SensorLoss(nn.Module):
 
 
 def belief_loss(model: Filter, unit: Tensor) -> DEnKFLoss:
-    """Returns the CRPS of belief and forecast, in units of a good sensor's errors; poses follow from velocities."""
+    """Returns the CRPS of belief and forecast, in units of a good sensor's errors; poses have no term."""
     scale = torch.cat([torch.full((3,), torch.inf), unit])
-    share = len(VELOCITIES) / len(scale)  # a score is the mean over what counts: two of five
+    share = len(VELOCITIES) / len(scale)  # the mean over five components has two that count
     return DEnKFLoss(model, state=share, transition=share, sensor=0.0, state_scale=scale)
 
 
 class EndToEndLoss(nn.Module):
-    """The filter's loss, and the sensor's own next to it."""
+    """Adds the sensor's loss to the filter's loss."""
 
     def __init__(self, belief: nn.Module, sensor: SensorLoss):
         super().__init__()
@@ -71,11 +71,11 @@ class EndToEndLoss(nn.Module):
         return {**self.belief(frames), **own}
 
 
-# ------------------------------------------------------------------------------------- what is measured on whole drives
+# ------------------------------------------------------------------------------------- scores on whole drives
 
 
 def sensor_error(sensor: FlowSensor, drives: Sequence[TensorDict], unit: Tensor, longest: int) -> dict[str, float]:
-    """Returns CRPS of a sensor where it observes, mean of v and theta_dot in units of a good sensor's errors."""
+    """Returns the CRPS of a sensor on observed frames, mean of v and theta_dot in units of a good sensor's errors."""
     scores = []
     for data in drives:
         read = read_sensor(sensor, data, longest)
@@ -85,7 +85,7 @@ def sensor_error(sensor: FlowSensor, drives: Sequence[TensorDict], unit: Tensor,
 
 
 def gain_of(readings: TensorDict) -> Tensor:
-    """Returns the logarithm of how many times too far a sensor's readings of a whole drive lead."""
+    """Returns the logarithm of a sensor's gain on a whole drive: distance by its readings over true distance."""
     drive = all_frames(readings)[1:]
     read, driven = drive["sensor", "ensemble"].mean(-2)[..., 0], drive["state"][..., 3]
     return (read.sum() / driven.sum()).clamp(0.5, 2.0).log()
@@ -93,14 +93,14 @@ def gain_of(readings: TensorDict) -> Tensor:
 
 @torch.no_grad()
 def filter_readings(car: CarFilter, readings: Sequence[TensorDict], *, seed: int = 0) -> TensorDict:
-    """Filters readings of one length side by side, ``[K, N]``.
+    """Filters readings of equal length in one batch, ``[K, N]``.
 
-    Each begins at its true pose, with the velocities of its first reading.
+    Each run begins at the true pose, with the velocities of the first reading.
 
     Args:
         car: the filter.
         readings: each ``[N]``, see :func:`torch_denkf.applications.car.odometry.streams.take_spans`.
-        seed: of the filter's noise.
+        seed: seed of the filter's noise.
     """
     batch = TensorDict.stack([reading.copy() for reading in readings])
     batch["start"] = batch["state"].clone()
@@ -112,7 +112,7 @@ def filter_readings(car: CarFilter, readings: Sequence[TensorDict], *, seed: int
 
 
 def first_state(reading: TensorDict) -> Tensor:
-    """Returns the true first pose and the first velocities that the sensor reads, ``[5]``; zero where it reads none."""
+    """Returns the true first pose and the first reading of the velocities, ``[5]``; zeros without a reading."""
     start = reading["state"][0].clone()
     seen = reading["observed"].squeeze(-1).nonzero()
     row = int(seen[0]) if len(seen) else 0
@@ -127,10 +127,10 @@ def belief_error(car: CarFilter, readings: Sequence[TensorDict]) -> dict[str, fl
 
 
 def calibrate(car: CarFilter, readings: Sequence[TensorDict]) -> float:
-    """Returns the inflation with the least CRPS of the velocities times the path's distance from the true one.
+    """Returns the inflation with the least product of the velocities' CRPS and the path error.
 
-    By the coverage of the velocities alone an inflation is chosen that makes the path worse, which no reading sets
-    right. The filter's own inflation stays as it is.
+    Coverage of the velocities alone would choose an inflation with a larger path error, which no reading corrects. The
+    filter's inflation is unchanged.
     """
 
     def error() -> float:
@@ -150,7 +150,7 @@ def _crps(car: CarFilter, runs: Sequence[TensorDict]) -> float:
 
 
 def _all(car: CarFilter, readings: Sequence[TensorDict]) -> list[TensorDict]:
-    """Filters each reading as it is and with missing frames; those of one length side by side, ``[K, N]``."""
+    """Filters each reading as recorded and with missing frames, in batches of equal length ``[K, N]``."""
     groups: dict[int, list[TensorDict]] = defaultdict(list)
     for seed, reading in enumerate(readings):
         groups[len(reading)] += [all_frames(reading), lose_frames(reading, seed)]
@@ -158,7 +158,7 @@ def _all(car: CarFilter, readings: Sequence[TensorDict]) -> list[TensorDict]:
 
 
 def _velocities(out: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns means and variances of (v, theta_dot), and the truth ``[*K, N - 1, 2]``: the first row is given."""
+    """Returns means and variances of (v, theta_dot), and the truth ``[*K, N - 1, 2]``, without the first row."""
     values = out["belief", "mean"], out["belief", "var"], out["state"]
     mean, variance, truth = (value[..., 1:, VELOCITIES] for value in values)
     return mean, variance.clamp_min(1e-8), truth

@@ -1,4 +1,4 @@
-"""Training and test data of a car filter: the flow of whole drives, and a frozen sensor's readings of them."""
+"""Training and test data of a car filter: optical flow of whole drives, and readings of a frozen sensor."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = [
     "take_spans",
 ]
 
-MISSING = 0.3  # share of frames that are black, or do not arrive
+MISSING = 0.3  # share of black, or missing, frames
 
 _DISTURBANCES = {
     "salt_and_pepper": lambda generator: SaltAndPepper(in_keys=("image",), generator=generator),
@@ -48,17 +48,17 @@ CONDITIONS = ("clean", *_DISTURBANCES)
 
 @dataclass(frozen=True)
 class Drive:
-    """One camera's images of a drive, under one condition, compared over some number of steps.
+    """Images of one camera of a drive, under one condition, in pairs of a fixed number of steps.
 
     Attributes:
         root: folder with ``sequences`` and ``poses``.
-        name: of the drive.
-        size: (H, W) that the images are scaled to.
-        cache: folder in which the flow is kept; ``True`` for the library's.
-        condition: ``"clean"``, or what happens to its images: one of ``CONDITIONS``.
-        steps: between the two frames of a pair.
-        pitch: rad; the camera is taken to look so far up, and the sensor has to find out that it does not.
-        height: of the camera over the road, in m.
+        name: name of the drive.
+        size: (H, W) of the scaled images.
+        cache: folder of the cached flow; ``True`` for the library's.
+        condition: ``"clean"``, or a disturbance of the images, one of ``CONDITIONS``.
+        steps: steps between the two frames of a pair.
+        pitch: error of the assumed pitch of the camera, rad, which the sensor must learn to estimate.
+        height: height of the camera over the road, in m.
         weight: share of the batches.
         camera: folder of the images; by default the first that has any.
         two_view: whether corners are tracked, too.
@@ -77,7 +77,7 @@ class Drive:
     two_view: bool = False
 
     def disturbed(self) -> list[Drive]:
-        """Returns this drive clean, and with half as much weight in all disturbances together."""
+        """Returns this drive clean, and under all disturbances with half the weight together."""
         share = 0.5 * self.weight / len(_DISTURBANCES)
         return [self, *(replace(self, condition=name, weight=share) for name in _DISTURBANCES)]
 
@@ -86,11 +86,11 @@ class Drive:
         return [replace(self, steps=steps, weight=0.5**steps * self.weight) for steps in range(2, longest + 1)]
 
     def spans(self, longest: int) -> list[Drive]:
-        """Returns this drive in pairs of 1 to ``longest`` steps; a disturbed one in pairs of neighbours alone."""
+        """Returns this drive in pairs of 1 to ``longest`` steps; a disturbed one only in pairs of neighbours."""
         return [replace(self, steps=steps) for steps in range(1, (longest if self.condition == "clean" else 1) + 1)]
 
     def read(self) -> TensorDict:
-        """Returns flow, road and the truth, ``[N]``, memory-mapped."""
+        """Returns flow, road correlation and ground truth, ``[N]``, memory-mapped."""
         drive = read_kitti_drive(
             self.root, self.name, camera=self.camera, size=self.size, colour=False, cache=self.cache
         )
@@ -110,7 +110,7 @@ class Drive:
 
 
 def rows(data: TensorDict, index: Tensor, longest: int) -> TensorDict:
-    """Returns rows of a drive as the sensor reads them, and what it should read.
+    """Returns the sensor's inputs and targets of rows of a drive.
 
     ``"target_observation"`` ``[*B, 2]`` is the sum of the true velocities over all steps of the pair.
     """
@@ -128,7 +128,7 @@ def mirror(frames: TensorDict) -> TensorDict:
 
 @torch.no_grad()
 def read_sensor(sensor: FlowSensor, data: TensorDict, longest: int, *, mirrored: bool = False) -> TensorDict:
-    """Returns a sensor's readings of a whole drive ``[N]``, on the CPU, from the same random numbers each time."""
+    """Returns a sensor's readings of a whole drive ``[N]``, on the CPU, with fixed random numbers."""
     readings, was_training, device = [], sensor.training, next(sensor.parameters()).device
     sensor.eval()
     with torch.random.fork_rng(devices=[]):
@@ -147,8 +147,8 @@ def read_spans(sensor: FlowSensor, drives: Sequence[TensorDict], longest: int, *
     Args:
         sensor: the sensor.
         drives: the drive in pairs of 1, 2, ... steps, each ``[N]``; see :meth:`Drive.spans`.
-        longest: spans that the result has, K; those without a drive are not observed.
-        mirrored: whether the mirrored drive is read.
+        longest: K, largest number of steps in the result; pairs without a drive are not observed.
+        mirrored: whether to mirror the drive.
 
     Returns:
         ``[N]``: ``"state"`` ``[N, 5]``; ``("spans", "observed")`` ``[N, K, 1]``, ``("spans", "ensemble")``
@@ -168,10 +168,10 @@ def read_spans(sensor: FlowSensor, drives: Sequence[TensorDict], longest: int, *
 
 
 def take_spans(readings: TensorDict, steps: Tensor) -> TensorDict:
-    """Selects readings of pairs ``steps`` apart, ``[*B]``, from those of 1, 2, ... steps; missing where that is 0.
+    """Selects readings of pairs ``steps`` apart, ``[*B]``, from those of 1, 2, ... steps; 0 marks a missing pair.
 
     Returns:
-        A copy, as a filter without its sensor reads it: ``"observed"`` and ``"steps"`` ``[*B, 1]``, ``"sensor"``.
+        A copy with the inputs of a filter without its sensor: ``"observed"`` and ``"steps"`` ``[*B, 1]``, ``"sensor"``.
     """
     spans = readings["spans"]
     index = (steps - 1).clamp(0, spans.shape[-1] - 1).unsqueeze(-1)

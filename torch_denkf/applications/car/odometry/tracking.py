@@ -1,4 +1,4 @@
-"""Runs a car filter on images as they come, without poses."""
+"""Runs a car filter on a stream of images without poses."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ from torch_denkf.diagnosis.logs import warn_of_log
 __all__ = ["TrackedBelief", "track"]
 
 _LONGEST_GAP = 100  # steps without a frame that are bridged by prediction
-_EARLY = 0.25  # steps that a frame may come before its time
+_EARLY = 0.25  # steps by which a frame may be early
 
 
 class TrackedBelief(NamedTuple):
     """Belief of :func:`track` after a frame.
 
     Attributes:
-        frame: number of the frame among those given, from 0.
-        time: of the frame, in s.
-        observed: whether the sensor could compare it with one before.
-        mean: x m forward, y m to the left (of the first pose), theta rad to the left, v m/s, theta_dot rad/s: ``[5]``.
-        var: variances of them, ``[5]``.
+        frame: index of the frame in the input, from 0.
+        time: time of the frame, in s.
+        observed: whether the frame forms a pair with an earlier one.
+        mean: mean of (x m forward, y m to the left of the first pose, theta rad to the left, v m/s, theta_dot rad/s),
+            ``[5]``.
+        var: variances, ``[5]``.
         ensemble: members, ``[E, 5]``.
-        reading: mean (v m/s, theta_dot rad/s) that the sensor reads of the steps since the frame before, ``[2]``;
-            ``None`` where it could not compare.
-        hidden: share of the picture that stands still before the moving camera, 0 to 1: dirt, or a box.
+        reading: sensor's mean reading (v m/s, theta_dot rad/s) over the steps of the pair, ``[2]``; ``None`` without a
+            pair.
+        hidden: share of the image with a static occlusion, such as dirt or a box, 0 to 1.
     """
 
     frame: int
@@ -63,40 +64,39 @@ def track(
     repair: bool = True,
     seed: int = 0,
 ) -> Iterator[TrackedBelief]:
-    """Follows a car by its camera's images, one at a time, in a memory that does not grow.
+    """Tracks a car by its camera's images, frame by frame, with constant memory.
 
-    The path begins at the origin, heading forwards, with the velocities that the sensor reads from the first pair of
-    frames; before that pair is there nothing is returned. Of a camera that is faster than the filter's steps (0.103 s)
-    only every second, third ... frame is used. Where frames are missing, the next one is compared with the last that
-    was there, at most three steps back, and the path between is corrected.
+    The path begins at the origin, heading forwards, with the velocities of the first frame pair; nothing is returned
+    before that pair. If the camera is faster than the filter's steps (0.103 s), only every n-th frame is used. After
+    missing frames, the next one is compared with the last existing one, at most three steps back, and the path between
+    is corrected.
 
-    **One camera cannot see how high it is mounted**: a height that is 10 % too large makes the path 10 % too long, and
-    nothing in the images contradicts it. Measure it. A focal length that is too short makes it too long likewise. What
-    can be seen is warned of: a focal length that is too long for the images, a camera that looks far up or down, a road
-    that is not one, speeds beyond the sensor's range.
+    **One camera cannot estimate its own height**: a height that is 10 % too large makes the path 10 % too long, and
+    nothing in the images contradicts it. Measure it. A focal length that is too short also makes the path too long.
+    Warnings report detectable errors: a focal length that is too long for the images, a large pitch of the camera, a
+    road that is no plane, speeds beyond the sensor's range.
 
     Args:
         car: the filter, see :func:`torch_denkf.pretrained.from_pretrained`.
         frames: rectified images: grey ``[H, W]``, or in colour ``[H, W, 3]`` in OpenCV's order, uint8, all of one size;
-            ``None`` for a frame that is missing.
+            ``None`` for a missing frame.
         calibration: focal lengths and principal point (fx, fy, cx, cy) in pixels of the images.
-        times: of the frames in s, as many as frames.
-        fps: frames in a second, in the place of ``times``. Without both, frames are one filter step apart.
-        height: of the camera over the road, in m.
-        pitch: how far the camera looks up from the road, in rad; -0.04 to 0.02 are found out without.
-        black_level: a frame counts as missing if it is black all over: at most a thousandth of its pixels is brighter
-            than this grey value, of 255. No street looks like that, not even at night. Likewise if it is white, or of
-            any other colour, all over: at most a thousandth is farther than half of this from the pixel in the middle
-            of all. ``None`` checks nothing.
-        repair: whether the flow is continued over what stands still before the moving camera, see
-            ``vision.signs.static_region``.
-        seed: of the filter's noise.
+        times: times of the frames in s, one for each.
+        fps: frames per second, instead of ``times``. Without both, frames are one filter step apart.
+        height: height of the camera over the road, in m.
+        pitch: upward pitch of the camera relative to the road, in rad; the sensor estimates -0.04 to 0.02 itself.
+        black_level: a frame counts as missing if it is entirely black: at most a thousandth of its pixels is brighter
+            than this grey value, of 255. No street looks like that, not even at night. The same holds for any other
+            uniform colour: at most a thousandth differs from the median by more than half of this. ``None`` checks
+            nothing.
+        repair: whether to extrapolate the flow over static occlusions, see ``vision.signs.static_region``.
+        seed: seed of the filter's noise.
 
     Returns:
-        Beliefs, one for each frame that is used, from the first pair on.
+        Beliefs, one for each used frame, from the first pair on.
 
     Raises:
-        ValueError: if calibration, height, times or images are not as above.
+        ValueError: if calibration, height, times or images are invalid.
 
     Example:
         >>> from torch_denkf.applications.car.odometry.filter import car_filter
@@ -123,7 +123,7 @@ def track(
 
 
 def _seen(frames: Iterable[np.ndarray | None], black_level: int | None) -> Iterator[np.ndarray | None]:
-    """Yields the frames, ``None`` for those that are missing, black or of one colour."""
+    """Yields the frames; ``None`` for missing, black or uniform ones."""
     for number, frame in enumerate(frames):
         if frame is not None:
             check_frame(frame, number)
@@ -131,7 +131,7 @@ def _seen(frames: Iterable[np.ndarray | None], black_level: int | None) -> Itera
 
 
 def _is_blank(frame: np.ndarray, level: int) -> bool:
-    """Tells whether hardly a pixel is brighter than the level, or differs from the others."""
+    """Returns True for an entirely black or uniform frame."""
     if float((frame > level).mean()) <= 1e-3:
         return True
     middle = np.median(frame[::8, ::8].reshape(-1, *frame.shape[2:]), 0)
@@ -184,7 +184,7 @@ def _track(car, frames, calibration, times, fps, height, pitch, repair, seed) ->
 
 
 class _Seen(NamedTuple):
-    """The last frame that was there."""
+    """Last existing frame."""
 
     step: int
     number: int
@@ -198,7 +198,7 @@ def _clock(times: Iterable[float] | None, fps: float | None, dt: float) -> tuple
         period = dt if fps is None else 1 / fps
         return _Clock(dt, period), (number * period for number in count())
     try:
-        known = [float(time) for time in times]  # numbers alone: a day at 10 Hz is 7 MB
+        known = [float(time) for time in times]  # memory is small: 7 MB for a day at 10 Hz
     except (TypeError, ValueError) as error:
         raise ValueError(f"times are those of the frames in s, a number each ({error})") from error
     period = median(after - before for before, after in pairwise(known)) if len(known) > 1 else dt
@@ -209,17 +209,17 @@ def _clock(times: Iterable[float] | None, fps: float | None, dt: float) -> tuple
 
 
 class _Clock:
-    """Tells the filter's step that a frame belongs to; ``None`` for one that comes too early to be a step.
+    """Maps the time of a frame to the filter's step; ``None`` for a frame between two steps.
 
-    A filter moves in steps of the length that it was trained with. Of a faster camera only every second, third ...
-    frame is a step; where frames are missing, steps are left out.
+    A filter has the step length of its training. Of a faster camera only every n-th frame is a step; missing frames
+    skip steps.
 
     Args:
         dt: the filter's step, in s.
-        period: between two frames, in s.
+        period: time between two frames, in s.
 
     Raises:
-        ValueError: if no whole number of frames is about as long as a step.
+        ValueError: if no multiple of the period is close to a step.
 
     Example:
         >>> clock = _Clock(dt=0.103, period=1 / 30)
@@ -254,8 +254,8 @@ class _Run:
         car: the filter.
         reading: flow and road of the first pair.
         between: steps of that pair.
-        speed_up: the filter's step over the real time of one; velocities are multiplied by it.
-        seed: of the noise.
+        speed_up: ratio of the filter's step to its real duration, a factor on velocities.
+        seed: seed of the noise.
     """
 
     def __init__(self, car: CarFilter, reading: dict[str, Tensor], between: int, speed_up: float, seed: int):

@@ -1,4 +1,4 @@
-"""Trains a car filter: its sensor alone, the filter on readings of drives that the sensor has not seen, then both."""
+"""Trains a car filter: the sensor, then the filter on readings of other drives, then both."""
 
 from __future__ import annotations
 
@@ -73,34 +73,33 @@ def train_car_filter(
 ) -> CarFilter:
     """Trains a car filter on recorded drives, rendered ones, or both.
 
-    A filter learns how wrong its sensor is on new drives, so the sensor and the filter learn from different ones; and
-    what decides between parameters is measured on a third kind
-    (:func:`torch_denkf.applications.car.odometry.roles.assign_roles`). The stages:
+    The filter must learn the sensor's errors on unseen drives, so that sensor and filter are trained on different
+    drives, and validated on others (:func:`torch_denkf.applications.car.odometry.roles.assign_roles`). The stages:
 
     1. the sensor alone, by the CRPS of its samples against the true velocities;
-    2. the filter on the frozen sensor's readings, by the CRPS of its belief. Some frames are lost on purpose, and
-       windows begin at a wrong velocity, or the filter would learn to ignore its sensor;
-    3. both end to end, but for the noise model, which knows by now how wrong the sensor is on new drives;
-    4. one number, the inflation, by the CRPS of the velocities times the path's error on the validation drives.
+    2. the filter on the frozen sensor's readings, by the CRPS of its belief. Some frames are dropped, and windows begin
+       at a wrong velocity, as otherwise the filter would learn to ignore its sensor;
+    3. both end to end, except for the noise model, which has learned the sensor's errors on unseen drives;
+    4. the inflation, by the CRPS of the velocities times the path error on the validation drives.
 
-    A call that is repeated goes on where the last one ended, also after a kill, and leaves the same weights.
+    A repeated call resumes an interrupted training, also after a kill, and gives the same weights.
 
     Args:
         out: folder; gets the filter (see :func:`torch_denkf.pretrained.save_pretrained`), checkpoints and logs below
             ``training``, rendered drives below ``rendered``, and optical flow of all drives below ``cache``.
         root: folder of recorded drives in KITTI's layout, with ``sequences`` and ``poses``.
         drives: names of the drives below ``root``; all by default.
-        leave_out: names of drives below ``root`` that must not be seen.
-        rendered: how many drives to render.
-        frames: of a rendered drive.
-        size: (H, W) that images are scaled to.
-        height: of the recorded drives' camera over the road, in m.
+        leave_out: names of drives below ``root`` that must not be used.
+        rendered: number of drives to render.
+        frames: frames of a rendered drive.
+        size: (H, W) of the scaled images.
+        height: height of the recorded drives' camera over the road, in m.
         updates: length of the stages.
-        seed: of all random numbers, and of the rendered drives.
-        device: that the networks run on.
-        processes: that render at a time; ``None`` is one for each core.
-        command: how this was called, for the record.
-        progress: whether bars, or off a terminal a line every ten seconds, say how far it is.
+        seed: seed of all random numbers, and of the rendered drives.
+        device: device of the networks.
+        processes: number of rendering processes; ``None`` stands for one per core.
+        command: command line, for the record.
+        progress: whether to show progress bars, or without a terminal a line every ten seconds.
 
     Returns:
         The trained filter, on the CPU.
@@ -156,7 +155,7 @@ def train_car_filter(
 
 
 def _read(drives: Sequence[Drive], progress: bool) -> dict[Drive, TensorDict]:
-    """Returns flow, road and truth of each drive; 10 to 30 ms a frame the first time."""
+    """Returns flow, road correlation and ground truth of each drive; takes 10 to 30 ms per frame without a cache."""
     data = {}
     with progress_bar("optical flow", len(drives), unit=" drives", shown=progress) as bar:
         for drive in drives:
@@ -174,7 +173,7 @@ def _groups(drives: Sequence[Drive], data: dict[Drive, TensorDict], longest: int
 
 
 def _settings(drives: Sequence[Drive], data: dict[Drive, TensorDict]) -> CarSettings:
-    """Returns statistics of the drives that train the sensor, each counted mirrored, too: turns have the mean zero."""
+    """Returns settings with statistics of the sensor's drives and their mirror images: turn rates have mean zero."""
     clean = [data[drive] for drive in drives if drive.condition == "clean" and drive.steps == 1]
     v, theta_dot = torch.cat([each["state"][:, VELOCITIES] for each in clean]).unbind(-1)
     focal = max(float(each["calibration"][0, 0]) for each in clean)
@@ -224,7 +223,7 @@ def _train_filter(
     trainer: dict[str, Any],
     progress: bool,
 ) -> tuple[float, float]:
-    """Trains the filter on readings, then end to end; the gain error of the sensor, and the last validation."""
+    """Trains the filter on readings, then end to end; returns the sensor's gain error and the last validation."""
     settings, longest = car.settings, car.settings.longest
     unit, start_std = settings.unit, settings.start_std
     groups, parts = _groups(roles["filter"], data, longest), [p for d in roles["filter"] for p in d.disturbed()]
@@ -256,7 +255,7 @@ def _train_filter(
             EndToEndLoss(belief_loss(car, unit), SensorLoss(car.sensor, unit)),
             lambda generator, length: pairs.windows(generator, length, start_std),
             updates.end_to_end,
-            # The noise model knows by now how wrong the sensor is on new drives; on those it has seen it would forget.
+            # The noise model is frozen: on the sensor's training drives it would unlearn the errors on unseen drives.
             parameters=[p for name, p in car.named_parameters() if not name.startswith("module.noise.")],
             lr=1e-4,
             lengths={start: min(steps, updates.length) for start, steps in ((0, 4), (third, 8), (2 * third, 16))},

@@ -1,1 +1,1 @@
-"""A street as a camera on a car sees it: a random scene along a path, drawn with OpenCV and NumPy."""
+"""Renderer of a street for a camera on a car: a random scene along a path, drawn with OpenCV and NumPy."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-HEIGHT = 1.65  # m: of KITTI's cameras above the road
-KITTI_FOCAL = 718.856 / 1241  # of the odometry benchmark, as a share of the picture's width
+HEIGHT = 1.65  # m: height of KITTI's cameras above the road
+KITTI_FOCAL = 718.856 / 1241  # focal length of the odometry benchmark, relative to the image's width
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class Camera:
 
     Attributes:
         size: (H, W) in pixels.
-        fx: focal length in pixels of the width; fy of the height; (cx, cy) the principal point.
-        height: of the camera above the ground, in m.
+        fx: horizontal focal length in pixels; fy is the vertical one, (cx, cy) the principal point.
+        height: height of the camera above the ground, in m.
     """
 
     size: tuple[int, int]
@@ -35,11 +35,11 @@ class Camera:
 
     @classmethod
     def odometry(cls, size: tuple[int, int], focal: float = KITTI_FOCAL) -> Camera:
-        """Returns the left camera of the odometry drives (1241 x 376), scaled to ``size``; its poses look down by 1°.
+        """Returns the left camera of the odometry drives (1241 x 376), scaled to ``size``; its pitch is 1° downward.
 
         Args:
             size: (H, W) in pixels.
-            focal: focal length as a share of the width.
+            focal: focal length relative to the width.
         """
         return cls._scaled(size, (376, 1241), focal * 1241, 607.1928, 185.2157)
 

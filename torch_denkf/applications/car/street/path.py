@@ -1,4 +1,4 @@
-"""The path of a drive as a line with a point a metre, on which road, roadside and traffic are laid out."""
+"""Path of a drive with one point per metre, along which road, roadside and traffic are placed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Path:
     """A path in (x right, z ahead), in m.
 
     Attributes:
-        line: a point a metre, ``[M, 2]``.
-        heading: at these points in rad, to the left, unwrapped, ``[M]``.
+        line: one point per metre, ``[M, 2]``.
+        heading: heading at these points in rad, to the left, unwrapped, ``[M]``.
         heights: y (down) of the ground at these points, ``[M]``.
-        along: where each frame is on the line, in m from its first point, ``[N]``.
+        along: position of each frame on the line, in m from its first point, ``[N]``.
     """
 
     line: np.ndarray
@@ -39,7 +39,7 @@ class Path:
         """
         check_length("the path", state[:, :2])
         points, theta = np.column_stack([-state[:, 1], state[:, 0]]), np.unwrap(state[:, 2])
-        # A car at rest jitters by millimetres: a frame counts once the car is 0.25 m further.
+        # Poses of a car at rest jitter by millimetres: a frame is kept once the car has moved 0.25 m.
         kept = [0]
         for k in range(1, len(points)):
             if np.hypot(*(points[k] - points[kept[-1]])) >= 0.25:
@@ -75,14 +75,13 @@ class Path:
         return np.stack([-np.cos(self.heading), -np.sin(self.heading)], -1)
 
     def at(self, along: np.ndarray, aside: np.ndarray | float = 0.0) -> np.ndarray:
-        """Places on or next to the line.
+        """Returns positions at a distance along the line and an offset to the left.
 
         Args:
             along: m from the line's first point, ``[T]``.
-            aside: m to the left.
+            aside: offset to the left, m.
 
-        Returns:
-            x, z and the heading's (x, z), ``[T, 4]``.
+        Returns: x, z and the heading's (x, z), ``[T, 4]``.
         """
         metres = np.arange(len(self.line))
         x, z, heading = (np.interp(along, metres, column) for column in (*self.line.T, self.heading))
@@ -91,11 +90,11 @@ class Path:
 
 
 def check_length(name: str, points: np.ndarray) -> None:
-    """Raises for paths that are too long to lay a scene out along them.
+    """Checks that a path is short enough for a scene.
 
     Args:
-        name: of the path, for the message.
-        points: places in m, ``[N, 2]`` or ``[N, 3]``.
+        name: name of the path, for the message.
+        points: positions in m, ``[N, 2]`` or ``[N, 3]``.
 
     Raises:
         ValueError: if the path is longer than 50 km, or not finite.

@@ -1,4 +1,4 @@
-"""Random drives: a car's planar motion, and hills and a swaying body for it."""
+"""Random drives: planar motion of a car, hills, and pitch and roll of its body."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from torch_denkf.applications.car.vision.poses import KITTI_DT, state_to_poses
 
-LOOKS_DOWN = 0.0185  # rad: the odometry drives' cameras against the road
+LOOKS_DOWN = 0.0185  # rad: downward pitch of the odometry drives' cameras
 
 
 def random_drive(frames: int, rng: np.random.Generator, dt: float = KITTI_DT) -> np.ndarray:
     """Returns a smooth random drive.
 
-    Speed is 0 to 15 m/s with few stops, accelerates by about 1 m/s² and brakes by at most 2, and is low where the
-    road is sharply bent: the turn rate stays below 0.5 rad/s and the acceleration to the side about 2.5 m/s².
+    The speed is 0 to 15 m/s with few stops; the car accelerates by about 1 m/s², brakes by at most 2 m/s², and is slow
+    in sharp bends: the turn rate stays below 0.5 rad/s and the lateral acceleration at about 2.5 m/s².
 
     Args:
         frames: rows, N.
@@ -22,7 +22,7 @@ def random_drive(frames: int, rng: np.random.Generator, dt: float = KITTI_DT) ->
 
     Returns:
         The state ``[N, 5]``, as :func:`torch_denkf.applications.car.read_kitti_drive` defines it; it starts at the
-        origin, and row t follows from row t-1 by v_t, θ_dot_t and the heading half way.
+        origin, and row t is computed from row t-1 by v_t, θ_dot_t and the mean heading.
     """
     time = dt * np.arange(frames)
     bend = 0.004 * np.interp(time, *_knots(rng, time[-1], (3, 6), lambda: rng.standard_normal()))  # 1/m
@@ -63,10 +63,10 @@ def _knots(rng: np.random.Generator, end: float, gap: tuple[float, float], draw)
 
 
 def hilly_poses(state: np.ndarray, rng: np.random.Generator, dt: float = KITTI_DT) -> np.ndarray:
-    """Returns camera poses of a drive over hills, in a car that pitches and rolls.
+    """Returns camera poses of a drive over hills, with pitch and roll of the car.
 
-    Slopes are up to about 6 %; the body pitches by 0.3° and rolls by 0.5° (standard deviations), and the camera looks
-    down by 1.06° as those of KITTI's odometry drives do.
+    Slopes are up to about 6 %; the body pitches by 0.3° and rolls by 0.5° (standard deviations), and the camera has a
+    downward pitch of 1.06° as in KITTI's odometry drives.
 
     Args:
         state: x and y in m, θ in rad in its first three columns, ``[N, 3]``.

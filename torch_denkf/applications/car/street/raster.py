@@ -1,4 +1,4 @@
-"""Small helpers of the drawing: regions of a picture, pyramid levels, interpolation between coarse columns."""
+"""Helpers for drawing: regions of an image, pyramid levels, interpolation between coarse columns."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ def hats(pixels: int, step: int) -> np.ndarray:
 
 
 def region(corners: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, int] | None:
-    """Returns the part of a picture that holds some points, with x0, y0, x1, y1; None where it is empty.
+    """Returns the bounding box x0, y0, x1, y1 of points, clipped to the image; None if it is empty.
 
     Args:
         corners: pixels (x, y), ``[n, 2]``.
-        shape: of the picture.
+        shape: shape of the image.
     """
     (left, top), (right, bottom) = corners.min(0), corners.max(0)
     x0, y0 = max(int(np.floor(left)), 0), max(int(np.floor(top)), 0)
@@ -25,18 +25,18 @@ def region(corners: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, 
 
 
 def level(minification: float, levels: int) -> int:
-    """Returns the level of a pyramid whose pixels are nearest in size to the picture's."""
+    """Returns the pyramid level with the pixel size nearest to the image's."""
     return int(np.clip(np.round(np.log2(max(minification, 1e-6))), 0, levels - 1))
 
 
 def hidden(pixels: np.ndarray, ahead: np.ndarray, solid: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Masks things that are outside the picture or fully occluded by nearer solid ones.
+    """Masks objects that are outside the image or fully occluded by nearer solid ones.
 
     Args:
-        pixels: of the feet and the heads of things on the ground, the nearest first, ``[n, 2, 4, 2]``.
-        ahead: whether all of them are in front of the camera, ``[n]``; other things are taken to be seen.
-        solid: whether nothing is seen through a thing from its foot to the lowest of its heads, ``[n]``.
-        shape: of the picture.
+        pixels: bottom and top corners of objects on the ground, the nearest first, ``[n, 2, 4, 2]``.
+        ahead: whether all corners are in front of the camera, ``[n]``; other objects count as visible.
+        solid: whether an object is opaque from its bottom to its lowest top corner, ``[n]``.
+        shape: shape of the image.
 
     Returns:
         ``[n]`` bool.

@@ -1,9 +1,8 @@
-"""Draws a scene from camera poses, with OpenCV and NumPy alone.
+"""Draws a scene from camera poses, with OpenCV and NumPy only.
 
-What moves in the images moves as a pinhole camera's motion predicts: every pixel of the ground is its ray's point on
-the terrain, walls are vertical planes warped by their homographies, trees and poles upright cards, the skyline is
-infinitely far. The pose may turn about all axes. A picture follows from pose and frame number alone, not from the
-pictures before it.
+Image motion is that of a pinhole camera: every pixel of the ground is its ray's intersection with the terrain, walls
+are vertical planes warped by their homographies, trees and poles are upright cards, the skyline is infinitely far. The
+pose may rotate about all axes. An image depends only on pose and frame number, not on earlier images.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from torch_denkf.applications.car.street.scene import PATCH, RESOLUTION, Scene
 from torch_denkf.applications.car.street.terrain import Relief
 from torch_denkf.applications.car.street.things import FAR, HAZE, Things
 
-GRID = 16  # m: new ground is drawn when the camera has moved that far
-DEPTHS = np.concatenate([np.geomspace(1.2, 200, 48), [400, 1500, 10000]])  # m: where the ground is looked up
-STEP = 16  # pixels: columns between those where it is
-LEVELS = 6  # of the ground's pyramid
+GRID = 16  # m: distance after which new ground is drawn
+DEPTHS = np.concatenate([np.geomspace(1.2, 200, 48), [400, 1500, 10000]])  # m: depths of look-ups of the ground
+STEP = 16  # pixels: distance of the columns with such look-ups
+LEVELS = 6  # levels of the ground's pyramid
 
 
 class Renderer:
@@ -29,16 +28,16 @@ class Renderer:
     Args:
         scene: the scene.
         camera: the camera.
-        supersample: (down, across), pixels drawn for each pixel of the picture, which averages them.
+        supersample: (down, across), number of drawn pixels that are averaged to one pixel.
     """
 
-    _relief: Relief  # around the stretch
+    _relief: Relief  # ground around the present position
 
     def __init__(self, scene: Scene, camera: Camera, supersample: tuple[int, int] = (3, 2)):
         self.scene, self.camera = scene, camera
         self.fine = fine = camera.supersampled(*supersample)
         height, width = fine.size
-        self._a = ((np.arange(width) - fine.cx) / fine.fx).astype(np.float32)  # of the pixels' rays (a, b, 1)
+        self._a = ((np.arange(width) - fine.cx) / fine.fx).astype(np.float32)  # rays of the pixels are (a, b, 1)
         self._b = ((np.arange(height) - fine.cy) / fine.fy).astype(np.float32)
         self._coarse_a = (np.arange(0, width + STEP, STEP) - fine.cx) / fine.fx
         self._coarse_b = (np.arange(0, height + STEP, STEP) - fine.cy) / fine.fy
@@ -49,12 +48,12 @@ class Renderer:
         self._pyramid: list[np.ndarray] = []
 
     def render(self, pose: np.ndarray, frame: int | None = None) -> np.ndarray:
-        """Draws one picture.
+        """Draws one image.
 
         Args:
             pose: camera-to-world matrix, ``[3, 4]``.
-            frame: number of the frame, which says where the traffic is and which stretch of the road is travelled;
-                without it there is no traffic, and the stretch is the nearest.
+            frame: number of the frame, which determines the traffic and the position on the road; without it there is
+                no traffic, and the position is the nearest point.
 
         Returns:
             BGR, uint8 ``[H, W, 3]``.
@@ -75,7 +74,7 @@ class Renderer:
         return cv2.LUT(averaged, table[None])
 
     def _travel(self, pose: np.ndarray, frame: int | None) -> None:
-        """Heights of the ground and of what stands on it, for the stretch where the camera is."""
+        """Updates the heights of the ground, and of objects on it, around the camera."""
         terrain = self.scene.terrain
         if frame is None:
             metre = int(np.linalg.norm(terrain.line - pose[[0, 2], 3], axis=-1).argmin())
@@ -87,10 +86,10 @@ class Renderer:
             self._things.settle(self._relief, terrain.line[stretch])
 
     def _ground_depth(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns one over the ground's depth at each pixel, and the row of its upper end in each column.
+        """Returns the ground's inverse depth at each pixel, and the row of the horizon in each column.
 
-        In each of some columns the ground is looked up at all depths and projected; between them one over the depth
-        is linear in row and column, exactly so on a plane.
+        In some columns the ground is looked up at all depths and projected; between them the inverse depth is
+        interpolated linearly in row and column, which is exact on a plane.
         """
         (right, down, ahead), place = pose[:, :3].T, pose[:, 3]
         depth = DEPTHS[:, None]
@@ -144,7 +143,7 @@ class Renderer:
         # A pixel covers dz x dx of ground; the pyramid's level follows their geometric mean.
         covered = np.sqrt(np.abs(np.gradient(middle)) * middle / self.fine.fx) if len(middle) > 1 else np.ones(1)
         levels = np.clip(np.round(np.log2(np.maximum(covered, 1e-6) / RESOLUTION)), 0, LEVELS - 1).astype(int)
-        # The far end stays a little green: a horizon as bright as the haze would look like water.
+        # Some of the ground's colour remains at the far end: a horizon as bright as the haze would look like water.
         clear = (0.3 + 0.7 * np.exp(-middle / HAZE)).astype(np.float32)[:, None, None]
         row = 0
         while row < len(levels):

@@ -1,4 +1,4 @@
-"""Lays out a random scene along a path: the road's surface, and what stands next to it."""
+"""Creates a random scene along a path: the road's surface, and objects next to it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from torch_denkf.applications.car.street.traffic import FAST, traffic
 
 __all__ = ["roadside_scene"]
 
-CELLS = 16e6  # of the map of what is taken, at most
-APART = 30  # m along the path: what is closer than a road's width and further apart than this is another visit
+CELLS = 16e6  # largest size of the occupancy map
+APART = 30  # m along the path: nearby points that are farther apart along the path belong to another visit
 HOUSE, TREE, POLE, CAR, HEDGE = range(5)
 
 
@@ -26,11 +26,10 @@ def roadside_scene(
 ) -> Scene:
     """Puts a road under a path, and houses, hedges, trees, poles and parked cars next to it.
 
-    Nothing stands on the road, whichever stretch of it: where a path crosses or repeats itself, one scene serves all
-    visits.
+    No object is on the road, also if the path crosses or repeats itself: one scene serves all visits.
 
     Args:
-        path: x and y in m, θ in rad, in its first three columns, ``[N, 3]``; the road goes on straight at its end.
+        path: x and y in m, θ in rad, in its first three columns, ``[N, 3]``; the road continues straight at its end.
         rng: source of randomness.
         ground: height of the ground under the car in each row, KITTI's y (down) in m, ``[N]``; by default level,
             1.65 m under a camera at 0.
@@ -84,14 +83,14 @@ def roadside_scene(
 
 
 def _exposure(frames: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns a gain that wanders by some 8 % within seconds."""
+    """Returns a gain that varies by about 8 % within seconds."""
     knots = np.arange(0, frames + 40, 40)
     return np.interp(np.arange(frames), knots, np.exp(0.08 * rng.standard_normal(len(knots))))
 
 
 def _first_visit(line: np.ndarray) -> np.ndarray:
-    """Masks the points of a line at a place for the first time, and not within 6 m of another stretch."""
-    # A pixel a metre keeps the number of the last point painted: painted backwards, the first one stays.
+    """Masks the points of a line that are not within 6 m of an earlier visit."""
+    # Points are painted backwards on a map of 1 m pixels, so that each pixel has the number of the first visit.
     low = line.min(0) - 8
     shape = np.ceil(line.max(0) - low + 8).astype(int) + 1
     step = max(1.0, np.sqrt(shape[0] * shape[1] / CELLS))
@@ -103,7 +102,7 @@ def _first_visit(line: np.ndarray) -> np.ndarray:
 
 
 class _Roadside:
-    """Places things one after another where nothing is yet."""
+    """Places objects one by one in free space."""
 
     def __init__(self, way: Path, road: np.ndarray, width: float, verge: float, rng: np.random.Generator):
         self.way, self.width, self.verge, self.rng = way, width, verge, rng
@@ -119,7 +118,7 @@ class _Roadside:
         return np.round((points - self.low) / self.cell * 16).astype(np.int32)
 
     def _take(self, corners: np.ndarray, distance: float) -> bool:
-        """Reserves a footprint if it is clear of all roads and things; returns True if it is."""
+        """Reserves a footprint if it is clear of all roads and objects; returns True on success."""
         x, z = np.round((corners - self.low) / self.cell).astype(int).T
         if x.min() < 0 or z.min() < 0 or x.max() >= self.taken.shape[1] or z.max() >= self.taken.shape[0]:
             return False
@@ -133,7 +132,7 @@ class _Roadside:
         return True
 
     def fill(self, cars: list[list[list[np.ndarray]]], fast: bool) -> list[Box | Card]:
-        """Returns everything that stands next to the road, on both sides."""
+        """Returns all objects next to the road, on both sides."""
         rng, way = self.rng, self.way
         make = self._makers(cars)
         kinds = rng.dirichlet([0.5, 5, 3, 0.1, 3] if fast else [4, 4, 2, 3, 2])  # this drive's share of each kind
@@ -146,7 +145,7 @@ class _Roadside:
         ahead, sideways = way.ahead, way.left
         objects: list[Box | Card] = []
         for side in (1, -1):  # left, right
-            edge = half + 1.75 * side  # of the road, from the path
+            edge = half + 1.75 * side  # distance of the road's edge from the path
             at = 0.0
             while at < len(way.line) - 1:
                 kind = int(rng.choice(5, p=kinds))
@@ -156,7 +155,7 @@ class _Roadside:
                 if item is not None:
                     objects.append(item)
                 at += length + rng.uniform(*gaps[kind])
-            for k in range(0, len(way.line), 1 + round(12 * dense)):  # what is further back
+            for k in range(0, len(way.line), 1 + round(12 * dense)):  # objects farther from the road
                 kind = TREE if fast or rng.random() < 0.7 else HOUSE
                 item = make[kind](way.line[k], side * sideways[k], ahead[k], edge + rng.uniform(6, 26), lengths[kind]())
                 if item is not None:
@@ -171,7 +170,7 @@ class _Roadside:
         hedges = [textures.pyramid(textures.hedge(rng), 5) for _ in range(4)]
 
         def block(place, ahead, half, distance) -> np.ndarray | None:
-            # The order of the corners makes x turn to z, whichever side of the road this is.
+            # The corners are ordered from x to z on both sides of the road.
             left = np.array([-ahead[1], ahead[0]])
             corners = place + np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * half @ np.stack([ahead, left])
             return corners if self._take(corners, distance) else None

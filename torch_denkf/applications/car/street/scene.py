@@ -1,8 +1,8 @@
-"""Static and moving things of a rendered drive, and the ground's picture from above.
+"""Static and moving objects of a rendered drive, and the ground's texture from above.
 
-Everything is fixed in the world but the cars of ``Scene.traffic``, in KITTI's axes: x right, y down, z forward,
-metres. Places are (x, z): things stand on the ground, whose height :mod:`torch_denkf.applications.car.street.terrain`
-gives.
+All objects except the cars of ``Scene.traffic`` are fixed in the world, in KITTI's axes: x right, y down, z forward,
+metres. Positions are (x, z): objects stand on the ground, whose height
+:mod:`torch_denkf.applications.car.street.terrain` gives.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch_denkf.applications.car.street import textures
 from torch_denkf.applications.car.street.terrain import Terrain
 
 RESOLUTION = 0.1  # m for each pixel of the ground's texture
-PATCH = 1536  # pixels: the piece of ground that is drawn at a time, 154 m wide
+PATCH = 1536  # pixels: size of the drawn patch of ground, 154 m
 
 
 @dataclass
@@ -42,12 +42,12 @@ class Card:
 
 @dataclass
 class Mover:
-    """A moving car: where its middle is, and where it heads.
+    """Moving car: positions and headings over time.
 
     Attributes:
         first: number of the frame of the first row of ``track``.
         track: x, z and the heading's (x, z) in each frame, ``[T, 4]``.
-        length: in m; width and height as well.
+        length: in m, as width and height.
         faces: texture pyramids of front, left, rear and right.
     """
 
@@ -59,7 +59,7 @@ class Mover:
     faces: list[list[np.ndarray]]
 
     def at(self, frame: int) -> Box | None:
-        """Returns the car in a frame, or None where it is not there."""
+        """Returns the car in a frame, or None if it does not exist."""
         if not 0 <= frame - self.first < len(self.track):
             return None
         x, z, ahead, up = self.track[frame - self.first]
@@ -82,12 +82,12 @@ class Scene:
         haze: colour of far things, BGR.
         light: factors of B, G and R.
         terrain: the ground's height.
-        metres: number of the terrain's point where the camera is in each frame, ``[N]``.
+        metres: index of the terrain's point at the camera's position in each frame, ``[N]``.
         road_width: in m.
         verge: width of the pavement on each side, in m.
         traffic: cars that move.
-        sun: (x, z) towards the sun, as long as shadows are for each metre of height; zero without shadows.
-        shade: brightness of what lies in a shadow.
+        sun: (x, z) towards the sun; its norm is the length of shadows per metre of height; zero without shadows.
+        shade: brightness in shadows.
         exposure: the camera's gain in each frame, ``[N]``, or None for 1.
         gamma: exponent of the grey values: contrast.
     """
@@ -151,7 +151,7 @@ class Scene:
         return patch
 
     def _shadow(self, dark: np.ndarray, item: Box | Card, pixels) -> None:
-        away = -self.sun * min(item.height, 9.0)  # of the top
+        away = -self.sun * min(item.height, 9.0)  # shadow of the top
         if isinstance(item, Box):
             hull = cv2.convexHull(pixels(np.concatenate([item.corners, item.corners + away])))
             cv2.fillConvexPoly(dark, hull, 255, cv2.LINE_8, 4)
@@ -167,13 +167,13 @@ class Scene:
 
 
 def lane_marks(road: np.ndarray, left: np.ndarray, keep: np.ndarray, edges: tuple[float, ...]) -> np.ndarray:
-    """Dashes of 3 m every 8 m along the middle of a road, and lines at its edges.
+    """Returns dashes of 3 m every 8 m along the middle of a road, and lines at its edges.
 
     Args:
-        road: centre line, a point a metre, ``[M, 2]``.
+        road: centre line, one point per metre, ``[M, 2]``.
         left: unit vectors to its left, ``[M, 2]``.
-        keep: where the road is marked, ``[M]`` bool.
-        edges: how far to the left of the middle unbroken lines are, in m.
+        keep: mask of points with markings, ``[M]`` bool.
+        edges: offsets of solid lines to the left of the middle, in m.
 
     Returns:
         Start and end of each piece, ``[D, 2, 2]``.

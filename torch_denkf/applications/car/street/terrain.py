@@ -1,9 +1,9 @@
-"""The ground under a path that climbs and falls.
+"""Ground under a path with climbs and descents.
 
-Along the path the ground lies a camera's height under the (smoothed) camera, so that the road follows hills; to the
-sides it is level. Recorded drives come back to a place metres higher or lower than before, because the altitude
-drifts. The ground is therefore no function of the place alone: :meth:`Terrain.around` gives it as the car finds it at
-one stretch of the path, from that stretch alone. Ground that two neighbouring stretches share is the same in both.
+Along the path the ground is the camera's height below the (smoothed) camera, so that the road follows hills; to the
+sides it is level. Recorded drives return to a place metres higher or lower than before, because the altitude drifts.
+The ground is therefore no function of the position: :meth:`Terrain.around` computes it for one section of the path,
+from that section only. Neighbouring sections agree on shared ground.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 CELL = 4.0  # m: grid on which heights are kept
 REACH = 160.0  # m: half the side of the grid
-BEHIND, AHEAD = 40, 220  # m of the path that shape the ground of a stretch
-SMOOTH = 4.0  # m: standard deviation of the filter along the path, so that the car's bouncing is no hill
+BEHIND, AHEAD = 40, 220  # m of the path that determine the ground of a section
+SMOOTH = 4.0  # m: standard deviation of the smoothing along the path, which removes the car's pitching
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Terrain:
     """Ground along a path.
 
     Args:
-        line: (x, z) of the path, a point a metre, ``[M, 2]``.
+        line: (x, z) of the path, one point per metre, ``[M, 2]``.
         heights: y of the ground (down) at these points in m, ``[M]``.
     """
 
@@ -50,11 +50,11 @@ class Terrain:
         self.line = line
         reach = round(4 * SMOOTH)
         kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTH) ** 2)
-        padded = np.pad(heights, reach, mode="reflect", reflect_type="odd")  # goes on with its slope
+        padded = np.pad(heights, reach, mode="reflect", reflect_type="odd")  # continues with its slope
         self.heights = np.convolve(padded, kernel / kernel.sum(), mode="valid")
 
     def around(self, metre: int) -> Relief:
-        """Returns the ground as it is from 40 m behind to 220 m ahead of a point of the path.
+        """Returns the ground from 40 m behind to 220 m ahead of a point of the path.
 
         Args:
             metre: number of the point.
@@ -68,8 +68,8 @@ class Terrain:
         ticks = CELL * np.arange(nodes)
         x, z = ((origin[k] + ticks)[:, None] - self.line[piece, k] for k in (0, 1))
         x, z = x.astype(np.float32) ** 2, z.astype(np.float32) ** 2
-        # Weights fall with the twelfth power of the distance: on the path the height is the path's, next to it the
-        # nearest points', and there is no step anywhere.
+        # Weights fall with the twelfth power of the distance: heights equal the path's on it, and the nearest points'
+        # next to it, without steps.
         weight = z[:, None] + (x + 6.0)
         weight *= weight * weight
         weight = 1 / (weight * weight)

@@ -46,7 +46,7 @@ def pyramid(texture: np.ndarray, levels: int) -> list[np.ndarray]:
 
 
 def ground(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Grass, pavement and asphalt, each repeated to a piece from which any PATCH can be cut."""
+    """Returns textures of grass, pavement and asphalt, tiled so that any PATCH can be cut out."""
     green, contrast = 0.8 + 0.4 * rng.random(), rng.uniform(0.6, 1.3)
     paving = np.array([(125, 130, 135), (105, 125, 140), (70, 95, 90)][rng.integers(3)])  # slabs, gravel, mown grass
     kinds = (

@@ -1,4 +1,4 @@
-"""Draws what stands and moves on the ground: walls as planes warped by their homographies, trees and poles as cards."""
+"""Draws objects and traffic: walls as planes warped by their homographies, trees and poles as cards."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch_denkf.applications.car.street.camera import Camera
 from torch_denkf.applications.car.street.scene import Box, Card, Scene
 from torch_denkf.applications.car.street.terrain import Relief
 
-HAZE = 140.0  # m: distance at which haze hides 63 %
+HAZE = 140.0  # m: distance at which haze absorbs 63 %
 NEAR, FAR = 1.0, 120.0  # m
-FADE = 25.0  # m before FAR from which on things grow transparent
+FADE = 25.0  # m before FAR at which objects start to become transparent
 
 Shown = Callable[[tuple[int, int, int, int], float], "np.ndarray | None"]
 
@@ -24,7 +24,7 @@ class Things:
 
     Args:
         scene: the scene.
-        camera: the camera of the pictures that are drawn in.
+        camera: the camera of the images.
     """
 
     def __init__(self, scene: Scene, camera: Camera):
@@ -34,20 +34,21 @@ class Things:
         self._sun = scene.sun / max(np.linalg.norm(scene.sun), 1e-9) * (1 - scene.shade)
 
     def settle(self, relief: Relief, place: np.ndarray) -> None:
-        """Places what is near (x, z) on the ground."""
+        """Places nearby objects at (x, z) on the ground."""
         self.relief = relief
         sight = FAR * np.hypot(1, self.camera.size[1] / (2 * self.camera.fx)) + 40
         near = np.linalg.norm(self.scene.places - place, axis=-1) < sight
         self.feet[near] = relief.at(self.corners[near, :, 0], self.corners[near, :, 1])
 
     def draw(self, picture: np.ndarray, pose: np.ndarray, cars: list[Box], shown: Shown) -> None:
-        """Draws all that is seen.
+        """Draws all visible objects.
 
         Args:
-            picture: BGR, drawn in.
+            picture: BGR image to draw into.
             pose: camera-to-world matrix, ``[3, 4]``.
             cars: the traffic.
-            shown: where in a region of the picture the ground does not hide what is at a depth; None for everywhere.
+            shown: returns the mask of a region's pixels in which the ground does not occlude an object at a depth; None
+                for no occlusion.
         """
         items = [*self.scene.objects, *cars]
         if not items:

@@ -1,6 +1,6 @@
-"""Cars that move against the scene: oncoming ones, and cars ahead in the own lane.
+"""Moving cars: oncoming ones, and cars ahead in the same lane.
 
-They follow the path of the drive, at their own speed. Their motion in the image is therefore not the camera's.
+They follow the path of the drive at their own speed, so that their image motion differs from the static scene's.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from torch_denkf.applications.car.street.path import Path
 from torch_denkf.applications.car.street.scene import Mover
 from torch_denkf.applications.car.vision.poses import KITTI_DT
 
-SIGHT = 125.0  # m ahead at which cars enter and leave, beyond what is drawn
+SIGHT = 125.0  # m ahead at which cars enter and leave, beyond the drawing distance
 BACK = 12.0  # m behind the camera
-FAST = 17.0  # m/s: of a motorway, whose other lane goes the same way
+FAST = 17.0  # m/s: speed of a motorway, whose other lane has the same direction
 
 
 def traffic(path: Path, cars: list[list[list[np.ndarray]]], rng: np.random.Generator) -> list[Mover]:
@@ -54,7 +54,7 @@ def traffic(path: Path, cars: list[list[list[np.ndarray]]], rng: np.random.Gener
 
 
 def _leader(path: Path, time: np.ndarray, length: float, faces, rng: np.random.Generator) -> list[Mover]:
-    """Returns a car ahead, which comes nearer, stays for a while at varying distance and pulls away."""
+    """Returns a car ahead, which approaches, stays at a varying distance, and departs."""
     knots = [0.0, *np.arange(rng.uniform(6, 10), length - 6, 5.0), length]
     gaps = [SIGHT, *rng.uniform(8, 40, len(knots) - 2), SIGHT]
     gap = np.interp(time, knots, gaps, left=np.inf, right=np.inf)
@@ -62,13 +62,13 @@ def _leader(path: Path, time: np.ndarray, length: float, faces, rng: np.random.G
     gap[~inside] = SIGHT
     smooth = np.hanning(23)[1:-1]
     gap = np.convolve(np.pad(gap, 10, mode="edge"), smooth / smooth.sum(), mode="valid")
-    # A distance that shrinks faster than the car drives would be a car in reverse.
+    # A distance that shrinks faster than our speed would let the other car drive backwards.
     along = np.maximum.accumulate(path.along + np.where(inside, gap, SIGHT))
     return _seen(path, np.where(inside, along, np.inf), rng.normal(0, 0.2), 1.0, faces, rng)
 
 
 def _seen(path: Path, along: np.ndarray, aside: float, pace: float, faces, rng: np.random.Generator) -> list[Mover]:
-    """Returns the part of a car's way in which it is near the camera; its passes, if it is near several times."""
+    """Returns the parts of a car's track near the camera, one for each pass."""
     ahead = along - path.along
     near = np.flatnonzero((ahead > -BACK) & (ahead < SIGHT) & (along > 0) & (along < len(path.line) - 1))
     size = rng.uniform(3.8, 4.9), rng.uniform(1.65, 1.9), rng.uniform(1.4, 1.75)

@@ -1,4 +1,4 @@
-"""One virtual camera for all real ones, so that intrinsics and resolution drop out."""
+"""Canonical camera, which makes images independent of intrinsics and resolution."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch_denkf._checks import check_number
 
 __all__ = ["CanonicalCamera", "KITTI_HEIGHT"]
 
-KITTI_HEIGHT = 1.65  # m, of KITTI's cameras over the road (Geiger et al. 2013, figure 3)
+KITTI_HEIGHT = 1.65  # m, height of KITTI's cameras over the road (Geiger et al. 2013, figure 3)
 
-# Tangents of half the angles of view. KITTI's cameras see 0.85 to 0.87 to each side and 0.24 to 0.28 up and down.
+# Tangents of half the angles of view; KITTI's cameras have 0.85 to 0.87 horizontally and 0.24 to 0.28 vertically.
 _HALF_WIDTH, _HALF_HEIGHT = 0.86, 0.27
 
 
@@ -20,7 +20,7 @@ _HALF_WIDTH, _HALF_HEIGHT = 0.86, 0.27
 class CanonicalCamera:
     """A pinhole camera with a fixed field of view and its principal point in the middle.
 
-    Its image coordinates are ``x = (column - (width - 1) / 2) / focal`` (to the right) and likewise ``y`` (down):
+    Its image coordinates are ``x = (column - (width - 1) / 2) / focal`` (to the right) and the same for ``y`` (down):
     tangents of angles from the optical axis.
 
     Attributes:
@@ -34,10 +34,10 @@ class CanonicalCamera:
 
     @classmethod
     def near(cls, calibration) -> CanonicalCamera:
-        """Returns the one whose resolution fits a real camera's ``(fx, fy, cx, cy)``, in pixels.
+        """Returns the canonical camera with a resolution near a real camera's ``(fx, fy, cx, cy)``, in pixels.
 
-        Small images are enlarged to a focal length of 120 pixels, below which dense optical flow loses the road, and
-        large ones reduced to 240, beyond which it only costs time.
+        Small images are enlarged to a focal length of 120 pixels, below which dense optical flow fails on the road, and
+        large ones scaled down to 240, beyond which accuracy does not improve.
         """
         return cls(min(max(0.96 * float(calibration[0]), 120.0), 240.0))
 
@@ -61,10 +61,10 @@ class CanonicalCamera:
         Returns:
             ``[height, width]``, uint8.
         """
-        import cv2  # half of this package needs no OpenCV: what reads the flow, and the filters
+        import cv2  # imported here, as sensors and filters need no OpenCV
 
         fx, fy, cx, cy = (float(value) for value in calibration)
-        if fx > 1.5 * self.focal:  # linear interpolation alone would skip pixels
+        if fx > 1.5 * self.focal:  # linear interpolation would skip pixels
             height, width = image.shape
             size = round(width * self.focal / fx), round(height * self.focal / fx)
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

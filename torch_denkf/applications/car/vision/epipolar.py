@@ -1,4 +1,4 @@
-"""The turn and the direction of travel between two frames, from corners that are tracked: two-view geometry."""
+"""Two-view geometry: turn and direction of travel between two frames from tracked corners."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ __all__ = ["TwoView", "fit_two_view", "track_corners", "two_view_motion"]
 
 _CORNERS, _QUALITY, _APART = 800, 0.003, 5  # at most; share of the best corner's strength; pixels between two
 _WINDOW, _LEVELS = (13, 13), 4
-_BACK = 0.2  # pixels: a corner that is tracked to the new frame and back ends so near to where it was
+_BACK = 0.2  # pixels: largest error of a corner that is tracked forwards and backwards
 _SPECK = 40  # grey levels between a black or white pixel and the median around it
-_FOCAL = 200.0  # pixels: of smaller images corners are located too coarsely
+_FOCAL = 200.0  # pixels: with a shorter focal length corners are localised too coarsely
 _LEAST = 15  # corners for a fit of five numbers
-_TURN_STD = 0.3  # rad, before anything is seen
-_LEAST_NOISE = 2e-4  # of a corner, in tangents: a twentieth of a pixel
+_TURN_STD = 0.3  # rad, prior
+_LEAST_NOISE = 2e-4  # noise of a corner, in tangents: a twentieth of a pixel
 _ITERATIONS = 12
-_LONGEST_MOVE = 0.03  # of the focus in one iteration
-_STEP = 1e-5  # of finite differences
+_LONGEST_MOVE = 0.03  # largest change of the focus in one iteration
+_STEP = 1e-5  # step of finite differences
 
 
 class TwoView(NamedTuple):
@@ -31,10 +31,10 @@ class TwoView(NamedTuple):
 
     Attributes:
         turn: to the left, up and anticlockwise around the axis, in rad, ``[3]``.
-        focus: image point (right, down) of the newer frame that everything comes out of, ``[2]``, in tangents.
+        focus: focus of expansion (right, down) in the newer frame, ``[2]``, in tangents.
         turn_std: standard deviations of the turn, ``[3]``.
         focus_std: standard deviations of the focus, ``[2]``.
-        inliers: share of the corners that the motion explains.
+        inliers: share of inliers among the corners.
     """
 
     turn: np.ndarray
@@ -47,15 +47,15 @@ class TwoView(NamedTuple):
 def track_corners(
     previous: np.ndarray, current: np.ndarray, hidden: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Finds corners of one image in the next (Lucas and Kanade's pyramids), and drops those that do not come back.
+    """Tracks corners to the next image (pyramidal Lucas-Kanade), and drops those that fail the backward check.
 
     Args:
         previous: grey image ``[H, W]``, uint8.
         current: grey image ``[H, W]``, uint8.
-        hidden: where no corner is taken, ``[H, W]``, bool.
+        hidden: mask of occluded pixels, on which no corner is detected, ``[H, W]``, bool.
 
     Returns:
-        Columns and rows of the corners in both images, each ``[K, 2]``, float32; K is 0 where there are none.
+        Columns and rows of the corners in both images, each ``[K, 2]``, float32; K may be 0.
     """
     seen = None if hidden is None else 1 - grown(hidden, _WINDOW[0])
     corners = cv2.goodFeaturesToTrack(previous, _CORNERS, _QUALITY, _APART, mask=seen)
@@ -76,15 +76,15 @@ def _track(previous: np.ndarray, current: np.ndarray, corners: np.ndarray) -> tu
 
 
 def fit_two_view(first: np.ndarray, second: np.ndarray) -> TwoView:
-    r"""Fits the turn and the direction of travel to points that were seen from both places, at any distances.
+    r"""Fits the turn and the direction of travel to corresponding points at unknown depths.
 
-    A point that is seen along :math:`p` before and along :math:`q` after a motion by a rotation R and a translation
-    along t fulfils :math:`q^T [t]_\times R\,p = 0`. Gauss-Newton steps minimise Sampson's distance from that, with
-    Cauchy weights that ignore what moves on its own, and a weak prior for a car that stands still.
+    A point along :math:`p` before and along :math:`q` after a rotation R and a translation along t satisfies :math:`q^T
+    [t]_\times R\,p = 0`. Gauss-Newton steps minimise the Sampson distance, with Cauchy weights against moving objects,
+    and a weak prior for a car at rest.
 
-    Other than :func:`torch_denkf.applications.car.vision.expansion.focus_of_expansion`, which takes dense flow and
-    small turns, this is exact for turns of any size, and corners are located several times better than patches of road
-    and sky. On KITTI the error of the turn over 50 frames is a third of that one's.
+    Unlike :func:`torch_denkf.applications.car.vision.expansion.focus_of_expansion`, which uses dense flow and assumes
+    small turns, this is exact for turns of any size, and corners are localised several times better than patches of
+    road and sky. On KITTI the error of the turn over 50 frames is a third of that function's.
 
     Args:
         first: points of the older frame ``[K, 2]`` (right, down), in tangents.
@@ -94,13 +94,13 @@ def fit_two_view(first: np.ndarray, second: np.ndarray) -> TwoView:
         The motion of the camera from the older frame to the newer one.
 
     Raises:
-        ValueError: if there are fewer than 15 points, or not the same number in both.
+        ValueError: if there are fewer than 15 points, or the numbers differ.
 
     Source:
         Hartley & Zisserman, "Multiple View Geometry", 2004, sections 9.6 and 11.4.3.
 
     Example:
-        A camera turns 0.05 rad to the left; points far away all move to the right.
+        The camera turns 0.05 rad to the left, and far points move to the right.
 
         >>> grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 6), np.linspace(-0.2, 0.2, 5)), -1).reshape(-1, 2)
         >>> ahead = 1 - grid[:, :1] * np.tan(0.05)
@@ -116,7 +116,7 @@ def fit_two_view(first: np.ndarray, second: np.ndarray) -> TwoView:
     prior = np.array([0.0, 0.0, 0.0, *FOCUS_PRIOR])
     precision = np.array([_TURN_STD] * 3 + list(FOCUS_STD)) ** -2
     estimate = prior.copy()
-    # A turn moves all points alike.
+    # Initial turn: it moves all points by the same amount.
     estimate[:2] = np.median((second - first)[:, :2], 0)[::-1] * (-1, 1)
     for _ in range(_ITERATIONS):
         residual = _sampson(estimate, first, second)
@@ -134,7 +134,7 @@ def fit_two_view(first: np.ndarray, second: np.ndarray) -> TwoView:
 
 
 def _sampson(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns distances of point pairs ``[K, 3]`` from a motion: rotation vector and focus, ``[5]``."""
+    """Returns Sampson distances of point pairs ``[K, 3]`` for a motion: rotation vector and focus, ``[5]``."""
     x, y = motion[3:]
     essential = np.array([[0, -1, y], [1, 0, -x], [-y, x, 0]]) @ cv2.Rodrigues(motion[:3])[0]
     before, after = second @ essential, first @ essential.T
@@ -147,22 +147,21 @@ def two_view_motion(
 ) -> np.ndarray:
     """Returns the turn and the direction of travel between two images of one calibrated camera.
 
-    Corners are tracked on the images as they are: a median filter over all pixels, as the dense flow has it, or
-    resampling make the turn's error a tenth to a quarter larger. So only single black and white pixels are replaced,
-    and exposures are matched only where they differ. Small images are enlarged two or four times, to a focal length of
-    200 pixels or more: on 100 x 300 pixels that halves the turn's error over 50 frames.
+    Corners are tracked on the original images: a median filter over all pixels, as for the dense flow, or resampling
+    increase the turn's error by a tenth to a quarter. So only single black and white pixels are replaced, and exposures
+    are matched only if they differ. Small images are enlarged to a focal length of 200 pixels or more: on 100 x 300
+    pixels that halves the turn's error over 50 frames.
 
     Args:
         previous: grey image ``[H, W]``, uint8.
         current: grey image ``[H, W]``, uint8.
         calibration: (fx, fy, cx, cy) in pixels of the images.
-        hidden: where something hides the street in both images, ``[H, W]``, bool: its edges are no corners. ``None``
-            for nowhere.
+        hidden: mask of static occlusions, ``[H, W]``, bool, on which no corner is detected. ``None`` for none.
 
     Returns:
         ``TWO_VIEW_SHAPE``, float32: turn to the left, up and anticlockwise (rad), focus right and down (tangents),
-        standard deviations of the turn to the left and of the focus down, and the share of corners that the motion
-        explains; all zero where there are too few corners.
+        standard deviations of the turn to the left and of the focus down, and the share of inliers; all zero with too
+        few corners.
 
     Example:
         >>> street = np.random.default_rng(0).integers(0, 255, (60, 160)).astype(np.uint8)

@@ -12,23 +12,23 @@ from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE, FOCUS_PRIOR, 
 
 __all__ = ["Expansion", "coarse_cells", "focus_of_expansion"]
 
-_TURN_STD = 0.3  # rad, of each angle: no prior, but a car that stands still needs one
+_TURN_STD = 0.3  # rad, of each angle: a weak prior, which only a car at rest needs
 _ITERATIONS = 7
-_EVERY = 2  # of the columns: neighbours say nearly the same
-_SOME = 7  # of the cells tell how large the noise is: medians take longer than all the rest
-_TOGETHER = 20.0  # so many neighbouring cells err together; makes the standard deviations those seen on KITTI
-_NEAR = 0.06  # rad around the focus, where flow has no direction yet
-_LEAST_NOISE = 3e-4  # of a flow, in tangents: a twentieth of a pixel
-_LONGEST_MOVE = 0.03  # of the focus in one iteration
+_EVERY = 2  # uses every second column: neighbours are nearly redundant
+_SOME = 7  # estimates the noise from every seventh cell: the median takes longer than all the rest
+_TOGETHER = 20.0  # number of neighbouring cells with one common error; fits the standard deviations seen on KITTI
+_NEAR = 0.06  # rad around the focus, where the direction of the flow is not defined
+_LEAST_NOISE = 3e-4  # lower bound of the flow's noise, in tangents: a twentieth of a pixel
+_LONGEST_MOVE = 0.03  # largest step of the focus in one iteration
 
 
 class Expansion(NamedTuple):
     """The direction of travel and the turn between two frames.
 
     Attributes:
-        focus: image point (right, down) that everything comes out of ``[N, 2]``, in tangents: the direction of travel
-            seen from the camera. Its second entry is how far the camera looks up from the direction of travel.
-        turn: to the left, up, and anticlockwise around the axis ``[N, 3]``, in rad.
+        focus: focus of expansion, an image point (right, down) ``[N, 2]``, in tangents: the direction of travel in the
+            camera's axes. Its second entry is the camera's upward pitch relative to the direction of travel.
+        turn: rotation to the left, up, and anticlockwise around the axis ``[N, 3]``, in rad.
         focus_std: standard deviations of the focus ``[N, 2]``.
         turn_std: standard deviations of the turn ``[N, 3]``.
     """
@@ -41,22 +41,22 @@ class Expansion(NamedTuple):
 
 @torch.no_grad()
 def focus_of_expansion(flow: Tensor) -> Expansion:
-    r"""Fits a turn and a direction of travel to coarse flows, whatever the distances of what is seen.
+    r"""Fits rotation and direction of travel to coarse optical flow, without knowing the depth of the scene.
 
     Translation moves an image point p along the ray from the focus e, by an amount that depends on its distance;
-    a turn moves it by a known amount :math:`B(p)\,\omega`. So the part of the flow across the ray,
+    a rotation moves it by a known amount :math:`B(p)\,\omega`. So the part of the flow across the ray,
     :math:`n(p, e)^T (f(p) - B(p)\,\omega)`, is noise. Gauss-Newton steps minimise it over e and :math:`\omega` with
-    Cauchy weights, which ignore what moves on its own, and a weak prior for a car that stands still.
+    Cauchy weights against moving objects, and a weak prior for a car at rest.
 
-    On KITTI the focus is wrong by about 0.005 rad, nearly independently from frame to frame. A distance on the road's
-    plane is then wrong by 4 %. A path averages these errors out, but not those of an unknown pitch.
+    On KITTI the error of the focus is about 0.005 rad, nearly independent from frame to frame. It causes an error of
+    4 % in a distance on the road plane. Along a path these errors average out; those of an unknown pitch do not.
 
     Args:
         flow: ``[N, 3, 25, 79]``, motion to the right and down in tangents, and mismatch from 0 to 1; see
             :func:`torch_denkf.applications.car.vision.flow.coarse_flow`.
 
     Returns:
-        Direction of travel, turn and their standard deviations, of the flow's dtype (float32 at least).
+        Direction of travel, rotation and their standard deviations, of the flow's dtype (float32 at least).
 
     Raises:
         ValueError: if the flow has another shape.
@@ -66,7 +66,7 @@ def focus_of_expansion(flow: Tensor) -> Expansion:
         Bruss & Horn, "Passive navigation", 1983: distances eliminated in this way.
 
     Example:
-        Everything flees from a point 0.02 below the middle of the image, near things faster than far ones.
+        The flow points away from a focus 0.02 below the middle of the image, at random depths.
 
         >>> rows, columns = torch.linspace(-0.26, 0.26, 25), torch.linspace(-0.85, 0.85, 79)
         >>> down, right = torch.meshgrid(rows - 0.02, columns, indexing="ij")
@@ -103,24 +103,24 @@ def focus_of_expansion(flow: Tensor) -> Expansion:
 
 
 def _across(right: Tensor, down: Tensor, x: Tensor, y: Tensor, estimate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns flow across rays from the focus ``[N, K]``, its derivatives ``[N, 5, K]``, and which rays are long."""
+    """Returns flow across rays from the focus ``[N, K]``, its Jacobian ``[N, 5, K]``, and a mask of the long rays."""
     left, up, around, *focus = (value.unsqueeze(-1) for value in estimate.unbind(1))
     from_x, from_y = x - focus[0], y - focus[1]
     distance = (from_x**2 + from_y**2).sqrt().clamp_min(0.5 * _NEAR)
     along_x, along_y = from_x / distance, from_y / distance
-    # What a turn to the left, up and anticlockwise does to a point.
+    # Motion of an image point under rotations to the left, up and anticlockwise.
     turned_x, turned_y = (1 + x * x, x * y, -y), (x * y, 1 + y * y, x)
     own_x = right - left * turned_x[0] - up * turned_x[1] - around * turned_x[2]
     own_y = down - left * turned_y[0] - up * turned_y[1] - around * turned_y[2]
     residual = along_x * own_y - along_y * own_x
-    # Where the focus moves across a ray, the ray turns, and some of the flow along it comes to lie across.
+    # Moving the focus across a ray turns the ray, so part of the flow along the ray becomes flow across it.
     lever = (along_x * own_x + along_y * own_y) / distance
     of_turn = [along_y * a - along_x * b for a, b in zip(turned_x, turned_y, strict=True)]
     return residual, torch.stack([*of_turn, -lever * along_y, lever * along_x], 1), distance > _NEAR
 
 
 def coarse_cells() -> Tensor:
-    """Middles of the cells of a coarse flow, to the right and down, ``[2, 25 * 79]``, in tangents."""
+    """Returns the centres of the cells of a coarse flow, right and down, ``[2, 25 * 79]``, in tangents."""
     camera, (_, height, width) = CanonicalCamera(240.0), FLOW_SHAPE
     across, along = (size / 2 / camera.focal for size in (camera.width, camera.height))
     columns = ((torch.arange(width) + 0.5) / width * 2 - 1) * across

@@ -1,4 +1,4 @@
-"""Two images of one camera, brought to one exposure."""
+"""Matches the exposure of two images of a camera."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import numpy as np
 
 __all__ = ["same_exposure"]
 
-_LEAST_CONTRAST = 8.0  # grey levels between the quartiles: darker or flatter images are no exposure of a street
-_GAIN, _OFFSET = 1.15, 8.0  # contrast and grey levels by which neighbouring frames of one exposure differ, at most
+_LEAST_CONTRAST = 8.0  # grey levels between the quartiles; images with less contrast are not matched
+_GAIN, _OFFSET = 1.15, 8.0  # largest differences in contrast and grey level between frames of the same exposure
 
 
 def same_exposure(first: np.ndarray, second: np.ndarray, *, tolerance: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Returns both images with the quartiles of the one with more contrast; images without any stay as they are.
+    """Returns both images with the quartiles of the one with more contrast; images without contrast are unchanged.
 
     Args:
         first: grey image ``[H, W]``, uint8.
         second: grey image ``[H, W]``, uint8.
-        tolerance: leave images alone that differ no more than neighbouring frames of one exposure do.
+        tolerance: do not change images with a small difference, as between frames of the same exposure.
 
     Returns:
         Both, ``[H, W]``, uint8.

@@ -19,31 +19,29 @@ def dense_flow(previous: np.ndarray, current: np.ndarray, camera: CanonicalCamer
     Args:
         previous: canonical image ``[H, W]``, uint8.
         current: canonical image ``[H, W]``, uint8.
-        camera: of both.
+        camera: camera of both.
 
-    Returns:
-        ``[H, W, 2]``, float32: motion to the right and down, in units of the focal length (tangents).
+    Returns: ``[H, W, 2]``, float32: motion to the right and down, in units of the focal length (tangents).
     """
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
     previous, current = (np.ascontiguousarray(image) for image in (previous, current))  # OpenCV takes no views
-    # Searched from the current image, so that the vectors stand on its grid.
+    # Computed from the current image, so that the vectors are on its grid.
     flow = dis.calc(current, previous, None)  # type: ignore[call-overload]  # cv2 does not say that None is one to make
     return -flow / camera.focal
 
 
 def coarse_flow(flow: np.ndarray, previous: np.ndarray, current: np.ndarray, camera: CanonicalCamera) -> np.ndarray:
-    """Returns means of the flow over a coarse grid, with a channel that tells how far to trust it.
+    """Returns means of the flow over a coarse grid, and its mismatch as a measure of confidence.
 
     Args:
-        flow: as :func:`dense_flow` gives it, ``[H, W, 2]``.
+        flow: result of :func:`dense_flow`, ``[H, W, 2]``.
         previous: ``[H, W]``, uint8.
         current: ``[H, W]``, uint8.
-        camera: of both.
+        camera: camera of both.
 
-    Returns:
-        ``FLOW_SHAPE``, float32: motion to the right, motion down (tangents), and how badly ``previous``, moved by
-        the flow, matches ``current``: 0 as it is, 1 for a difference of 40 grey levels or more.
+    Returns: ``FLOW_SHAPE``, float32: motion to the right, motion down (tangents), and the difference of ``previous``,
+    warped by the flow, from ``current``: 1 for 40 grey levels or more.
     """
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     pixels = flow * camera.focal
@@ -57,7 +55,7 @@ def coarse_flow(flow: np.ndarray, previous: np.ndarray, current: np.ndarray, cam
 
 
 def median_turn(flow: np.ndarray) -> tuple[float, float]:
-    """Returns the turn to the left and up: the median flow ahead, where things are too far off to approach.
+    """Returns the turn to the left and up: the median flow straight ahead, where objects are far away.
 
     Args:
         flow: ``[H, W, 2]`` or coarser, in tangents.

@@ -1,4 +1,4 @@
-"""The street behind what hides it: pictures and flow, continued from around a hole."""
+"""Extrapolates images and flow over an occlusion from its surroundings."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from torch_denkf.applications.car.vision.shapes import FLOW_SHAPE
 
 __all__ = ["continue_flow", "continue_picture"]
 
-_RIM = 8  # pixels around what is hidden, whose flow it spoils
-_PICTURE_RIM = 2  # pixels whose grey values are mixed with those of what hides them
-_NEAR = 0.02  # rad around the focus: the flow along a ray says nothing of the distance there
-_NEAREST = 2.0  # of the flow along a ray over the distance from the focus: nothing comes nearer in one step
-_REACH = 3  # pixels that the continuation looks at
+_RIM = 8  # pixels around an occlusion with disturbed flow
+_PICTURE_RIM = 2  # pixels around an occlusion with mixed grey values
+_NEAR = 0.02  # rad around the focus, where the flow has no information about depth
+_NEAREST = 2.0  # largest ratio of the flow along a ray to the distance from the focus
+_REACH = 3  # pixels: radius of the inpainting
 
 
 def continue_picture(image: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Returns a canonical picture ``[H, W]``, uint8, without the edges of what hides a part of it ``[H, W]``, bool."""
+    """Returns a canonical image ``[H, W]``, uint8, without the edges of an occlusion ``[H, W]``, bool."""
     return cv2.inpaint(image, grown(hidden, _PICTURE_RIM), _REACH, cv2.INPAINT_TELEA)
 
 
 def continue_flow(
     flow: np.ndarray, coarse: np.ndarray, hidden: np.ndarray, camera: CanonicalCamera
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Returns the optical flow behind what hides the street, as its surroundings and the camera's motion say.
+    r"""Returns the optical flow extrapolated over an occlusion, from its surroundings and the camera's motion.
 
     The flow of a point p is that of the turn, plus :math:`\rho(p) (p - e)` with the focus of expansion e and an inverse
-    distance :math:`\rho`. Turn and focus are fitted to what is seen. The inverse distance is continued from around the
-    hole; near the focus, where flow is small, this is exact whatever it is.
+    distance :math:`\rho`. Turn and focus are fitted to the visible flow. The inverse distance is inpainted from the
+    surroundings; its errors have little effect near the focus, where flow is small.
 
     Args:
-        flow: as :func:`torch_denkf.applications.car.vision.flow.dense_flow` gives it, ``[H, W, 2]``.
+        flow: result of :func:`torch_denkf.applications.car.vision.flow.dense_flow`, ``[H, W, 2]``.
         coarse: the same with its mismatch, see :func:`torch_denkf.applications.car.vision.flow.coarse_flow`:
             ``FLOW_SHAPE``.
-        hidden: where the street is hidden, ``[H, W]``, bool.
-        camera: canonical, of the pictures.
+        hidden: mask of the occlusion, ``[H, W]``, bool.
+        camera: canonical camera of the images.
 
     Returns:
-        The flow ``[H, W, 2]``, and the coarse flow's mismatch, continued likewise, ``[25, 79]``.
+        The flow ``[H, W, 2]``, and the coarse flow's mismatch, inpainted, too, ``[25, 79]``.
     """
     hole = grown(hidden, _RIM)
     _, height, width = FLOW_SHAPE

@@ -1,4 +1,4 @@
-"""All that the flow sensor reads of two images."""
+"""Computes the flow sensor's inputs from two images."""
 
 from __future__ import annotations
 
@@ -24,25 +24,23 @@ def image_motion(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns coarse optical flow and road correlation between two images of one calibrated camera.
 
-    A median over 3 x 3 pixels comes first: it takes single wrong pixels away and leaves edges where they are. Then the
-    image with less contrast is brought to the other's exposure, because a camera changes it between frames and what
-    gets brighter is not another thing.
+    First a median over 3 x 3 pixels removes single outliers and preserves edges. Then the exposure of the image with
+    less contrast is matched to the other's.
 
     Args:
         previous: grey image ``[H, W]``, uint8.
         current: grey image ``[H, W]``, uint8.
         calibration: (fx, fy, cx, cy) in pixels of the images.
-        height: of the camera over the road, in m.
-        hidden: where something hides the street in both images, ``[H, W]``, bool, see
-            ``vision.signs.static_region``: pictures and flow are continued over it from
-            around it. ``None`` for nowhere.
+        height: height of the camera over the road, in m.
+        hidden: mask of static occlusions, ``[H, W]``, bool, see ``vision.signs.static_region``, over which images and
+            flow are extrapolated. ``None`` for none.
 
     Returns:
         The flow, ``FLOW_SHAPE`` (see :func:`coarse_flow`), and the correlation of the road, ``ROAD_SHAPE`` (see
         :func:`road_correlation`); both float32.
 
     Examples:
-        Two images that are the same have not moved.
+        Equal images have no motion.
 
         >>> image = np.random.default_rng(0).integers(0, 255, (50, 150)).astype(np.uint8)
         >>> flow, road = image_motion(image, image, (87.0, 86.5, 73.4, 24.8))

@@ -1,4 +1,4 @@
-"""Poses of a camera on a car, and the planar state of them that Kloss et al. filter.
+"""Conversion between camera poses on a car and the planar state of Kloss et al.
 
 A pose is the matrix ``[R | t]`` from camera to world coordinates, ``[3, 4]``, in metres. Camera axes point right, down
 and forward. Source: Kloss, Martius & Bohg 2021, arXiv:2012.14313.
@@ -18,13 +18,13 @@ def poses_to_state(poses: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
 
     Args:
         poses: camera-to-world matrices, ``[N, 3, 4]``, in m.
-        dt: time between rows, in s: one for all, or ``[N - 1]``.
+        dt: time between rows, in s: a number, or ``[N - 1]``.
 
     Returns:
         ``[N, 5]`` float64: x (camera z) and y (minus camera x) in m, θ in rad, left-positive and unwrapped, v in m/s,
-        θ_dot in rad/s. Row t's v and θ_dot are the motion from t-1 to t, so that the image pair (t-1, t) shows them;
-        row 0 copies those of row 1, its forward difference. v is the distance in the ground plane over dt, negative
-        where the car moves against the mean of both headings.
+        θ_dot in rad/s. v and θ_dot of row t are the motion from t-1 to t, as the image pair (t-1, t) shows it; row 0
+        copies those of row 1, its forward difference. v is the distance in the ground plane over dt, negative if the
+        car moves against the mean of both headings.
     """
     x, y = poses[:, 2, 3], -poses[:, 0, 3]
     theta = np.unwrap(-np.arctan2(-poses[:, 2, 0], poses[:, 2, 2]))
@@ -41,7 +41,7 @@ def poses_to_state(poses: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
 
 
 def state_to_poses(state: np.ndarray) -> np.ndarray:
-    """Returns camera poses of a level camera: the inverse of :func:`poses_to_state`.
+    """Returns poses of a level camera: the inverse of :func:`poses_to_state`.
 
     Args:
         state: ``[N, 3]`` or more columns: x and y in m, θ in rad.

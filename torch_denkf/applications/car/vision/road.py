@@ -1,9 +1,10 @@
-"""Motion over the road: two images, projected on the ground, correlated along the direction of travel.
+"""Motion over the road: correlates two images, projected on the ground, along the direction of travel.
 
-Dense optical flow shrinks on the near road, where motion is large and texture is poor; yet there the ground plane ties
-pixels to metres. Each image is projected on the plane under the car, for several pitches of the camera, and the older
-one is slid forwards under the newer. The pitch and the distance at which both agree best give the motion, with no
-learned part; normalised correlation drops brightness and contrast. A network reads the whole table of correlations.
+Dense optical flow is too small on the near road, where motion is large and texture is poor; but the ground plane gives
+pixels a metric scale. Each image is projected on the plane under the car, for several pitches of the camera, and the
+older one is shifted against the newer. The pitch and the distance with the largest correlation give the motion, without
+a learned part; normalised correlation ignores brightness and contrast. The flow sensor reads the whole table of
+correlations.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from torch_denkf.applications.car.vision.shapes import CELL, ROAD_PITCHES, ROAD_
 
 __all__ = ["road_correlation"]
 
-_LENGTH, _HALF_WIDTH, _LANES = 7.0, 3.0, 32  # m, m, columns: the stretch of road that is compared
-_NEAREST = 4.0  # m: nearer, a cell is many pixels
+_LENGTH, _HALF_WIDTH, _LANES = 7.0, 3.0, 32  # m, m, columns: the compared piece of road
+_NEAREST = 4.0  # m: a nearer cell covers many pixels
 
 
 def road_correlation(
@@ -34,13 +35,12 @@ def road_correlation(
     Args:
         previous: canonical image ``[H, W]``, uint8.
         current: canonical image ``[H, W]``, uint8.
-        camera: of both.
-        turn: how far the camera turned to the left and up between them, in rad; see
+        camera: camera of both.
+        turn: turn of the camera to the left and up between the images, in rad; see
             :func:`torch_denkf.applications.car.vision.flow.median_turn`.
-        height: of the camera over the road, in m.
+        height: height of the camera over the road, in m.
 
-    Returns:
-        ``ROAD_SHAPE`` = (pitches, distances), float32 in [-1, 1].
+    Returns: ``ROAD_SHAPE`` = (pitches, distances), float32 in [-1, 1].
     """
     previous, current = (cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32) for image in (previous, current))
     left, up = turn
@@ -50,7 +50,7 @@ def road_correlation(
         nearest = _nearest(camera, float(pitch), height) - ROAD_SHIFTS[0]
         cells = round(_LENGTH / CELL)
         ahead = nearest + np.arange(cells) * CELL
-        # Both views are turned half way, so that the motion between them is straight ahead.
+        # Each view is rotated by half of the turn, so that the motion between them is straight ahead.
         now = _plan(current, camera, pitch, height, ahead, -left / 2, 0.0)
         before = nearest + (first + np.arange(cells + count - 1)) * CELL
         then = _plan(previous, camera, pitch, height, before, left / 2, up)
@@ -74,7 +74,7 @@ def _plan(image, camera, pitch, height, ahead, left, up) -> np.ndarray:
     down = height * np.cos(pitch) + forward * np.sin(pitch)
     columns, rows = camera.pixels(right / depth, down / depth - up)
     plan = cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
-    # Shading that varies slowly would match at any distance.
+    # Slowly varying shading would match at any distance.
     return plan - cv2.GaussianBlur(plan, (0, 0), sigmaX=3.2, sigmaY=10)
 
 

@@ -1,4 +1,4 @@
-"""Signs in two pictures that the camera fails: what stands still before it, what is too bright, what is too dark."""
+"""Signs of a camera fault in two images: static occlusions, over- and underexposure."""
 
 from __future__ import annotations
 
@@ -20,36 +20,37 @@ PICTURE_SIGNS = ("static", "bright", "dark", "exposure")
 #: Names of the entries of :func:`flow_signs`.
 FLOW_SIGNS = ("plane", "road")
 
-_CELLS = 60  # across a picture
-_LEAST_CELLS = 3  # sides of the smallest region that counts
-_LEAST_SIDE = 3  # pixels of a cell: fewer stay the same by chance
+_CELLS = 60  # number of cells across an image
+_LEAST_CELLS = 3  # side of the smallest counted region, cells
+_LEAST_SIDE = 3  # smallest side of a cell, pixels: smaller ones may be unchanged by chance
 _BELOW = 0.08  # tangents below the camera's axis: the road, up to 20 m ahead of KITTI's camera
-_STANDING = 0.05  # m: added to distances, so that a car that stands has a ratio
+_STANDING = 0.05  # m: added to distances, so that their ratio is finite at standstill
 _WHITE, _BLACK = 250, 5  # grey levels at which a pixel counts as too bright, or too dark
 
 
 def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, cells: int = _CELLS) -> np.ndarray:
-    """Masks what stands still before a moving camera: dirt on the lens, an occlusion, dead pixels.
+    """Masks static pixels before a moving camera: dirt on the lens, an occlusion, dead pixels.
 
-    The picture is divided into square cells. A cell is static if none of its pixels changed by more than the noise,
-    while more than half of the cells did change. Cells that are too bright in both pictures are left out, because an
-    overexposed sky does not change either; and so are regions that nowhere reach three by three cells.
+    The image is divided into square cells. A cell is static if none of its pixels changed by more than the noise, while
+    more than half of the cells did change. Overexposed cells are left out, because an overexposed sky does not change
+    either; and so are regions smaller than three by three cells.
 
     Args:
         previous: grey picture ``[H, W]``, uint8.
         current: the next picture ``[H, W]``, uint8.
-        noise: grey levels by which a pixel changes though nothing moves. A median over 3 x 3 pixels is taken before.
-        cells: across the picture.
+        noise: grey levels of image noise, after a median filter over 3 x 3 pixels.
+        cells: number of cells across the image.
 
     Returns:
-        ``[H, W]``, bool. All False where half of the picture does not change: the camera stands, or shows nothing.
+        ``[H, W]``, bool. All False if half of the image does not change: the camera stands still, or the image is
+        uniform.
 
     Raises:
-        ValueError: if the pictures are not of one shape, or a number is out of range.
+        ValueError: if the images differ in shape, or a number is out of range.
 
     Example:
         >>> draw = np.random.default_rng(0).integers(0, 200, (2, 100, 300)).astype(np.uint8)
-        >>> draw[:, 40:70, 60:120] = 7  # something hides 6 % of both pictures
+        >>> draw[:, 40:70, 60:120] = 7  # an occlusion of 6 % of both images
         >>> region = static_region(*draw)
         >>> round(float(region.mean()), 3), bool(region[45:65, 65:115].all())
         (0.057, True)
@@ -72,18 +73,18 @@ def static_region(previous: np.ndarray, current: np.ndarray, *, noise: int = 0, 
 
 
 def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) -> np.ndarray:
-    """Numbers that are small for two pictures of a sound camera, and large for those of one that fails.
+    """Returns signs of a fault that are small for two images of a working camera, and large for a failing one.
 
-    An :class:`torch_denkf.monitoring.InnovationMonitor` watches them besides the innovations, and a
-    :class:`torch_denkf.monitoring.SignGate` takes readings out by them; both take from clean data what is large.
+    An :class:`torch_denkf.monitoring.InnovationMonitor` monitors them together with the innovations, and a
+    :class:`torch_denkf.monitoring.SignGate` rejects readings by them; both calibrate their limits on clean data.
 
     ============ ======================================================================================================
     entry        content
     ============ ======================================================================================================
-    ``static``   share of the picture that stands still though the camera moves, see :func:`static_region`
-    ``bright``   share of the pixels that are white, of the picture that has more of them
-    ``dark``     share of the pixels that are black, likewise
-    ``exposure`` logarithm of the ratio of the pictures' mean brightness, without its sign
+    ``static``   share of static pixels although the camera moves, see :func:`static_region`
+    ``bright``   share of white pixels, in the image with more of them
+    ``dark``     share of black pixels, in the image with more of them
+    ``exposure`` absolute logarithm of the ratio of the images' mean brightness
     ============ ======================================================================================================
 
     Args:
@@ -100,7 +101,7 @@ def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) 
         [0.0, 0.0, 1.0, 4.8]
     """
     both = (previous, current)
-    means = [float(image.mean()) + 1 for image in both]  # a grey level more: a black picture has a logarithm, too
+    means = [float(image.mean()) + 1 for image in both]  # plus one grey level, so that the logarithm is finite
     return np.array(
         [
             static_region(previous, current, noise=noise).mean(),
@@ -113,7 +114,7 @@ def picture_signs(previous: np.ndarray, current: np.ndarray, *, noise: int = 0) 
 
 
 def _largest(values: np.ndarray, side: int) -> np.ndarray:
-    """Returns the largest value in each cell of so many pixels, those at the right and lower border included."""
+    """Returns the largest value in each cell, including those at the right and lower border."""
     height, width = values.shape
     padded = np.pad(values, ((0, -height % side), (0, -width % side)))
     return padded.reshape(padded.shape[0] // side, side, -1, side).max((1, 3))
@@ -123,21 +124,21 @@ def _largest(values: np.ndarray, side: int) -> np.ndarray:
 def plane_distance(flow: Tensor, *, height: float = KITTI_HEIGHT) -> Tensor:
     r"""Estimates the distance moved over a road from the flow below the horizon, as a cross-check.
 
-    A point of the road at p, in tangents, is :math:`h / y` away, where y is how far it lies below the focus of
-    expansion e. A camera that drives d moves it by :math:`d\, y / h\, (p - e)`, besides its turn. Each cell of the flow
-    gives a distance, and their median stands even where a car hides the lane, which :func:`road_correlation` reads.
+    A point of the road at p, in tangents, has the depth :math:`h / y`, where y is its distance below the focus of
+    expansion e.
 
-    It is too small, because dense flow shrinks on the near road: by 11 % on rendered drives, with a scatter of 5 %.
+    A motion of the camera by d shifts it by :math:`d\, y / h\, (p - e)`, in addition to the turn. Each cell of the flow
+    gives a distance, and their median is robust if a car occludes the lane, on which :func:`road_correlation` depends.
+    It is biased, because dense flow is too small on the near road: by 11 % on rendered drives, with a scatter of 5 %.
 
     Args:
         flow: ``[N, 3, 25, 79]``, see :func:`torch_denkf.applications.car.vision.flow.coarse_flow`.
-        height: of the camera over the road, in m.
+        height: height of the camera over the road, in m.
 
-    Returns:
-        Distances ``[N]`` in m, float32.
+    Returns: Distances ``[N]`` in m, float32.
 
     Example:
-        The plane of a road under a camera that drives 1.2 m.
+        Flow of a road plane under a camera that moves by 1.2 m.
 
         >>> x, y = coarse_cells()
         >>> flow = torch.stack([x, y, 0 * x]) * (1.2 / 1.65 * y.clamp_min(0))
@@ -156,19 +157,19 @@ def plane_distance(flow: Tensor, *, height: float = KITTI_HEIGHT) -> Tensor:
 
 
 def flow_signs(plane: Tensor, road: Tensor, distance: Tensor) -> Tensor:
-    """Signs that what was taken for the road is none, such as the back of a car close ahead.
+    """Returns signs of an occluded road, such as by the back of a car close ahead.
 
     ============ ======================================================================================================
     entry        content
     ============ ======================================================================================================
-    ``plane``    logarithm of the ratio of the distance by all of the flow to that of the sensor, without its sign
-    ``road``     1 less the largest correlation of the road, see :func:`road_correlation`
+    ``plane``    absolute logarithm of the ratio of the distance by all flow to the sensor's distance
+    ``road``     1 minus the largest correlation of the road, see :func:`road_correlation`
     ============ ======================================================================================================
 
     Args:
         plane: see :func:`plane_distance`, ``[N]``.
         road: ``[N, 13, 69]``.
-        distance: that a sensor reads, ``[N]`` in m.
+        distance: reading of the sensor, ``[N]`` in m.
 
     Returns:
         ``[N, 2]``, in the order of ``FLOW_SIGNS``.

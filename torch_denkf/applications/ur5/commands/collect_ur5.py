@@ -37,7 +37,7 @@ __all__ = ["CollectUR5"]
 
 @dataclass
 class CollectUR5(Command):
-    """Collect demonstrations of the UR5 table; a repeated command goes on where the last one ended."""
+    """Collect demonstrations of the UR5 table; a repeated command continues where the last one ended."""
 
     out: Path  # folder of the demos
     demos: int = 2000  # that the folder shall have

@@ -1,4 +1,4 @@
-"""A whole collection of demos at one resolution: decoded once, then memory-mapped."""
+"""Memory-mapped cache of a collection of demos at one resolution."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read_entries(root: Path) -> list[Entry]:
 
     Raises:
         FileNotFoundError: without the folder, or without a demo in it.
-        ValueError: naming the line, for a manifest that is damaged.
+        ValueError: if the manifest is damaged, with the line.
     """
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}; collect demos into it: {COMMAND} --out {root}")
@@ -45,7 +45,7 @@ def read_demos(
     cache: str | Path | bool | None,
     progress: Callable[[int], object],
 ) -> TensorDict:
-    """Demos one behind the other, from the cache or from their files, whose checksums are compared.
+    """Loads consecutive demos, from the cache or from their files, with verified checksums.
 
     ======================= ========== ==========================================================================
     key                     shape      content
@@ -55,24 +55,24 @@ def read_demos(
     ``rows``/``success``    [R,1]      bool
     ``rows``/``task``       [R,1]      int64, a number in ``TASKS``
     ``rows``/``step``       [R,1]      int64, from 0 in each demo
-    ``rows``/``frame``      [R,1]      int64: where its picture is in ``frames``, or -1
+    ``rows``/``frame``      [R,1]      int64: index of its image in ``frames``, or -1
     ``frames``/``pixels``   [F,3,H,W]  uint8
     ``frames``/``sum``      [F,3]      int64, over a frame's pixels
     ``frames``/``square``   [F,3]      int64, of squares, likewise
     ======================= ========== ==========================================================================
 
-    Without any pictures there are no ``frames``.
+    Without images there are no ``frames``.
 
     Args:
         root: folder of the demos.
         entries: the demos to read.
-        size: (H, W) to scale the pictures to; None leaves them as they are.
-        cache: folder of the cache; True for the usual one, None or False for none: then all is in memory.
-        progress: called with the number of demos that were read since the last call.
+        size: (H, W) of the images after scaling; None for no scaling.
+        cache: folder of the cache; True for the default, None or False for none, with all in memory.
+        progress: called with the number of demos read since the last call.
 
     Raises:
         FileNotFoundError: if a demo's file is missing.
-        ValueError: if one was changed, is no demo, or is of another size than the first; or if ``size`` is larger.
+        ValueError: if a file was changed, is no demo, or differs in size from the first; or if ``size`` is larger.
         OSError: if the cache cannot be written.
     """
     size = None if size is None else check_size(size)
@@ -131,7 +131,7 @@ def _read(
 
 
 def _rows(demo: Demo, shot: int) -> dict[str, np.ndarray]:
-    """Returns the rows of a demo whose first picture has the number ``shot``."""
+    """Returns the rows of a demo whose first image has the index ``shot``."""
     count = len(demo.state)
     frame = np.full(count, -1)
     frame[demo.steps] = np.arange(shot, shot + len(demo.steps))

@@ -1,9 +1,9 @@
-"""One demonstration of the UR5 table a file, a list of checksums for all, and what is read back is what was written.
+"""Files of UR5 demonstrations, one each, and a manifest with checksums.
 
 ::
 
-    root/collection.json     the options that all demos follow from
-    root/demos.jsonl         a line a demo: its file, checksum, and what it holds
+    root/collection.json     the options of the collection
+    root/demos.jsonl         a line per demo: file, checksum and sizes
     root/demo-NNNNNN.npz     the demos
 """
 
@@ -44,7 +44,7 @@ AGAIN = f"the collecting command ({COMMAND}), repeated, makes it again"
 
 @dataclass
 class Demo:
-    """One successful episode, T steps of it, n of them with a picture.
+    """A successful episode of T steps, n of them with an image.
 
     Attributes:
         number: of the demo in its collection.
@@ -52,10 +52,10 @@ class Demo:
         domain: one of ``DOMAIN_NAMES``.
         seed: of the environment, for this episode.
         state: float32 ``[T, 10]``, see :class:`torch_denkf.applications.ur5.UR5TableEnv`.
-        action: float32 ``[T, 7]``: sent in that state; it leads to the next row's.
+        action: float32 ``[T, 7]``: sent in that state; it leads to the next one.
         success: bool ``[T]``: the task is done in that state.
-        steps: int32 ``[n]``: rows that were drawn, ascending.
-        pixels: uint8 ``[n, 3, H, W]``: of these rows.
+        steps: int32 ``[n]``: rendered rows, ascending.
+        pixels: uint8 ``[n, 3, H, W]``: images of these rows.
     """
 
     number: int
@@ -79,7 +79,7 @@ class Entry:
         sha256: of the file, in hexadecimal.
         rows: T.
         frames: n.
-        failures: episodes that were drawn before this one and left out, since the expert failed.
+        failures: number of failed episodes of the expert before this one, which were dropped.
     """
 
     demo: int
@@ -91,7 +91,7 @@ class Entry:
 
 
 def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
-    """Writes a demo under a temporary name and renames it, so that files are complete. Equal demos, equal bytes.
+    """Writes a demo atomically. The bytes depend on the demo only.
 
     Raises:
         OSError: if the file cannot be written, as on a full disk; names it and the free space.
@@ -105,7 +105,7 @@ def write_demo(root: Path, demo: Demo, failures: int = 0) -> Entry:
 
 
 def what_is_wrong(root: Path, entry: Entry) -> str | None:
-    """Returns None for a file with the manifest's checksum, or else what is wrong, for a message."""
+    """Returns None for a file with the manifest's checksum, or else a message about the difference."""
     try:
         data = (root / entry.file).read_bytes()
     except OSError as error:
@@ -123,11 +123,11 @@ _HEADERS = threading.Lock()
 
 
 def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
-    """Reads the arrays of an npz file, by name; compares its header with the manifest before it is unpacked.
+    """Reads the arrays of an npz file by name, after a check of the headers.
 
-    NumPy reads headers with ``ast.literal_eval``, which in Python 3.11 fails now and then where threads do it at a
-    time ("AST constructor recursion depth mismatch", CPython issue 106905). So headers are read one after the other,
-    and decompression, which takes the time, side by side.
+    NumPy reads headers with ``ast.literal_eval``, which in Python 3.11 sometimes fails in concurrent threads ("AST
+    constructor recursion depth mismatch", CPython issue 106905). So headers are read sequentially, and decompression,
+    the slow part, is parallel.
     """
     arrays = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -140,10 +140,10 @@ def _read_arrays(data: bytes, entry: Entry) -> dict[str, np.ndarray]:
 
 
 def _check_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
-    """Looks at the headers alone: the rest could be of any size.
+    """Checks the headers only, before arrays of unknown size are unpacked.
 
     Raises:
-        ValueError: if an array is not what the manifest says.
+        ValueError: if an array differs from the manifest.
     """
     expected: dict[str, tuple[int | None, ...]] = {"state": (entry.rows, 10), "action": (entry.rows, 7)}
     expected |= {"success": (entry.rows,), "steps": (entry.frames,), "pixels": (entry.frames, 3, None, None)}
@@ -168,7 +168,7 @@ def _check_arrays(archive: zipfile.ZipFile, entry: Entry) -> None:
 
 
 class _OtherShape(ValueError):
-    """An array that is not what the manifest says."""
+    """Raised for an array that differs from the manifest."""
 
 
 def read_demo(root: Path, entry: Entry) -> Demo:
@@ -176,7 +176,7 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if it was changed, does not hold what the line says, or has numbers that are not finite.
+        ValueError: if it was changed, differs from the line, or has values that are not finite.
     """
     file = root / entry.file
     if (file.is_symlink() or file.exists()) and not file.is_file():
@@ -221,16 +221,15 @@ def read_demo(root: Path, entry: Entry) -> Demo:
 
 
 def read_manifest(root: Path, *, skip_damaged: bool = False) -> dict[int, Entry]:
-    """Returns entries by demo number, ascending; empty without a manifest. A truncated last line is left out.
+    """Returns entries by demo number, ascending; empty without a manifest. A truncated last line is skipped.
 
     Args:
         root: folder of the demos.
-        skip_damaged: True leaves lines out that are damaged, each with a warning, for a caller that makes their demos
-            again.
+        skip_damaged: True skips damaged lines with a warning, for a caller that records their demos again.
 
     Raises:
-        OSError: if the manifest is there and cannot be read.
-        ValueError: naming the line, for one that is damaged or lists a demo again.
+        OSError: if the manifest exists and cannot be read.
+        ValueError: if a line is damaged or a demo is repeated, with the line.
     """
     file = root / MANIFEST
     if not file.exists():
@@ -280,15 +279,15 @@ def _entry(line: str) -> Entry:
 
 
 def write_manifest(root: Path, entries: Iterable[Entry]) -> None:
-    """Writes the whole manifest, in the demos' order, at once."""
+    """Writes the manifest atomically, in the order of the demos."""
     write_text(root / MANIFEST, "".join(map(_line, sorted(entries, key=lambda entry: entry.demo))))
 
 
 def append_to_manifest(root: Path, entry: Entry) -> None:
-    """Adds a demo that was just written.
+    """Appends a demo.
 
     Raises:
-        OSError: if it cannot be added, as on a full disk; the manifest is then as it was.
+        OSError: if it cannot be appended, as on a full disk; the manifest is then unchanged.
     """
     file = root / MANIFEST
     with clear_errors(file):
@@ -305,7 +304,7 @@ def append_to_manifest(root: Path, entry: Entry) -> None:
 
 
 def write_options(root: Path, options: dict) -> None:
-    """Writes what all demos of the folder follow from."""
+    """Writes the options of the collection."""
     write_text(root / COLLECTION, json.dumps(options, indent=1) + "\n")
 
 

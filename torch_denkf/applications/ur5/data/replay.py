@@ -1,4 +1,4 @@
-"""Demonstrations of the UR5 table as one of torchrl's data sets."""
+"""Demonstrations of the UR5 table as a data set of torchrl."""
 
 from __future__ import annotations
 
@@ -28,31 +28,31 @@ class UR5ExperienceReplay(EpisodeReplay):
     key                   shape        content
     ===================== ============ ===========================================================================
     ``pixels``            [n,3,H,W]    float32 in [0, 1], zero where not observed; not in collections without any
-    ``observed``          [n,1]        bool: this step was drawn
+    ``observed``          [n,1]        bool: this step was rendered
     ``state``             [n,10]       float32, the truth, see :class:`torch_denkf.applications.ur5.UR5TableEnv`: J1 to
                                        J6 and the gripper's opening in rad, x, y, z in m
-    ``action``            [n,7]        float32, rad: sent in that state, it leads to the next row's
+    ``action``            [n,7]        float32, rad: sent in that state, it leads to the next one
     ``success``           [n,1]        bool: the task is done in that state
     ``task``              [n,1]        int64: 0 pick, 1 push, 2 put-down
     ===================== ============ ===========================================================================
 
-    Steps are 0.08 s apart. With ``frames_only`` the rows are those that were drawn, each on its own (``is_init`` and
-    ``next``/``done`` True everywhere); their ``step`` is the one in the whole demo.
+    Steps are 0.08 s apart. With ``frames_only`` the rows are the rendered ones, each as an episode (``is_init`` and
+    ``next``/``done`` True everywhere); their ``step`` is that in the demo.
 
-    The first time, all demos are decoded, compared with their checksums and scaled into a memory-mapped cache. 2,000
+    At the first use, all demos are decoded, verified by their checksums and scaled into a memory-mapped cache. 2,000
     demos at 112 px take 0.6 GB with 8 frames each, 26 GB with all.
 
-    A hash of its number alone puts a fifth of all demos into ``"test"``: a demo stays on its side however many there
-    are, at every size and in both domains.
+    The split depends on a hash of a demo's number only: a fifth of all demos is in ``"test"``, at every size and in
+    both domains.
 
     Args:
         root: folder of the demos.
-        size: (H, W) to scale pictures to, by averages over areas; as they are stored by default.
-        frames_only: True for the rows with a picture alone, to train a sensor on.
+        size: (H, W) of the images after scaling by area averages; by default the stored size.
+        frames_only: True for only the rows with an image, to train a sensor.
         **options: of :class:`~torch_denkf.data.EpisodeReplay`.
 
     Attributes:
-        episodes: what each ``"episode"`` is, with the ``demo``'s number and its ``task``.
+        episodes: list of the episodes, with the number of the ``demo`` and its ``task``.
 
     Raises:
         FileNotFoundError: without the folder, its manifest or a demo's file.
@@ -103,7 +103,7 @@ class UR5ExperienceReplay(EpisodeReplay):
         )
 
     def _picture_statistics(self, index: Tensor) -> dict[str, Tensor] | None:
-        """Returns them from the sums that the cache keeps of each picture."""
+        """Returns them from the sums over each image in the cache."""
         shots = self._frame[index]
         shots = shots[shots >= 0]
         if not len(shots):

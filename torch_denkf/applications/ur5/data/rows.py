@@ -1,4 +1,4 @@
-"""Demos as episodes of a data set: which are for tests, and their rows."""
+"""Demos as episodes of a data set: test split, and rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class UR5Episode(Episode):
 
 
 def is_for_tests(demo: int) -> bool:
-    """Returns True for demos of the test split: a fifth of all numbers, by a hash that no option changes."""
+    """Returns True for demos of the test split: a fifth of all numbers, by a hash that is independent of options."""
     digest = hashlib.sha256(f"ur5 demo {demo}".encode()).digest()
     return int.from_bytes(digest[:8], "big") % 5 == 0
 
@@ -42,7 +42,7 @@ def demo_rows(rows: TensorDictBase) -> TensorDict:
 
 
 def demo_episodes(rows: TensorDictBase, entries: Sequence[Entry]) -> list[UR5Episode]:
-    """Returns the episodes that rows consist of."""
+    """Returns the episodes of rows."""
     episodes, start = [], 0
     for entry in entries:
         task = TASKS[int(rows["task"][start])]

@@ -1,7 +1,7 @@
 """Collects demonstrations of the UR5 table into a folder.
 
-A repeated or killed call goes on with the demos that are missing, cut or changed. What comes out depends neither on
-that nor on the number of processes: demo i follows from the seed and i alone, byte for byte (pictures on the same
+A repeated call continues with the demos that are missing, truncated or changed. The result is independent of
+interruptions and of the number of processes: demo i depends on the seed and i only, byte for byte (images on the same
 machine and OpenGL library). :class:`torch_denkf.applications.ur5.UR5ExperienceReplay` reads the folder.
 """
 
@@ -43,33 +43,32 @@ def collect_ur5_demos(
     """Collect demos 0 to ``demos - 1`` of :class:`torch_denkf.applications.ur5.envs.expert.UR5Expert`, those that the
     folder does not have yet.
 
-    Demo i is of task ``tasks[i % len(tasks)]``. Only successes are kept: an episode at whose end the task is not done
-    is left out, and the demo's next seed is drawn; the manifest counts these failures.
+    Demo i is of task ``tasks[i % len(tasks)]``. Only successes are kept: a failed episode is dropped, and repeated with
+    the demo's next seed; the manifest has the number of failures.
 
     Args:
-        root: the folder, made if missing. Another collection's raises an error.
-        demos: how many the folder shall have. A larger number than before goes on where the last one ended.
-        size: (H, W) of the pictures.
-        frames: random steps of each demo to draw; 0 for all, None for no pictures (no OpenGL is needed then).
+        root: the folder, created if missing. One of another collection raises an error.
+        demos: total number of demos in the folder; a larger number than before extends the collection.
+        size: (H, W) of the images.
+        frames: number of random steps of each demo to render; 0 for all, None for no images (and no OpenGL).
         domain: ``"sim"`` or ``"real_like"``, see :class:`torch_denkf.applications.ur5.UR5TableEnv`.
         tasks: some of ``"pick"``, ``"push"`` and ``"put_down"``, in turn.
-        seed: another one gives other demos.
+        seed: of the demos.
         max_steps: rows of a demo. The episode is run for 350 steps even if fewer are kept: its end tells success.
         noise: of the expert's joint targets, rad, see :class:`torch_denkf.applications.ur5.envs.expert.UR5Expert`.
-        processes: how many collect at a time; 1 works in this process. More are spawned: a script that calls this
-            needs ``if __name__ == "__main__":``.
-        progress: called with the number of demos that were finished since the last call, those found there included.
+        processes: number of processes; 1 for the current process. More are spawned: a script that calls this needs ``if
+            __name__ == "__main__":``.
+        progress: called with the number of demos finished since the last call, including existing ones.
 
     Returns:
-        The number of demos that were made; the others were there.
+        The number of new demos.
 
     Raises:
         ValueError: for options out of range, or if the folder holds a collection of other options.
         OSError: if the folder cannot be written to, the disk is full, or another process is collecting into it.
-        RuntimeError: without OpenGL (the message names the packages), or if a demo fails again and again.
+        RuntimeError: without OpenGL (the message names the packages), or if a demo fails repeatedly.
 
-    Warns:
-        UserWarning: for each file whose checksum is wrong; it is made again.
+    Warns: UserWarning: for each file with a wrong checksum; it is recorded again.
 
     Examples:
         >>> import tempfile
@@ -95,7 +94,7 @@ def collect_ur5_demos(
 
 
 def _missing(root: Path, demos: int, options: Options) -> tuple[list[int], dict[int, Entry]]:
-    """Numbers of the demos to make, and the manifest without them."""
+    """Returns the numbers of the demos to record, and the manifest without them."""
     ours = {"format": FORMAT, **asdict(options)}
     ours |= {"size": list(options.size), "tasks": list(options.tasks)}  # as JSON gives them back
     entries = files.read_manifest(root, skip_damaged=True)

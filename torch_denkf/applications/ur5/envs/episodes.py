@@ -50,10 +50,10 @@ class Options:
 
 
 def make_demos(root: Path, options: Options, numbers: list[int], processes: int) -> Iterator[Entry]:
-    """Writes demos of these numbers and yields their entries as they get done, in any order.
+    """Writes demos of these numbers and yields their entries in order of completion.
 
     Raises:
-        RuntimeError: without OpenGL, if a demo fails again and again, or if a worker is killed.
+        RuntimeError: without OpenGL, if a demo fails repeatedly, or if a worker is killed.
         OSError: if a file cannot be written.
     """
     if not numbers:
@@ -106,7 +106,7 @@ def _task(options: Options, number: int) -> TaskName:
 
 
 def _episode(options: Options, number: int, attempt: int) -> Demo | None:
-    """Returns one episode, None if the task is not done at its end."""
+    """Returns one episode, or None if it failed."""
     task, length = _task(options, number), options.max_steps
     if (options, task) not in _envs:
         _envs[options, task] = UR5TableEnv(

@@ -12,17 +12,17 @@ __all__ = ["UR5Expert"]
 
 
 class UR5Expert(TensorDictModule):
-    """A policy that knows the task: it copies ``("expert", "action")`` to ``"action"``, with noise if asked to.
+    """Scripted expert policy: copies ``("expert", "action")`` to ``"action"``, optionally with noise.
 
-    It is **privileged**. The environment knows object, goal and home pose, and at reset plans the joints' way through
-    the task's waypoints: straight lines of the tool at minimum jerk (Flash and Hogan 1985), inverse kinematics by
-    damped least squares. What it emits at each step is the next row of that table. The policy itself holds nothing,
-    so one serves any number of environments, in SerialEnv, ParallelEnv and collectors.
+    It is **privileged**. From object, goal and home pose, the environment plans a joint trajectory through the task's
+    waypoints at reset: straight lines of the tool at minimum jerk (Flash and Hogan 1985), inverse kinematics by damped
+    least squares. It emits the next row of the trajectory at each step. The policy has no state, so one policy serves
+    any number of environments, in SerialEnv, ParallelEnv and collectors.
 
     Args:
         env: optional; checked to emit what the expert reads.
-        noise: standard deviation of Gaussian noise on the six joints' targets, rad, for more various demonstrations;
-            0.005 is harmless. The gripper's target has none.
+        noise: standard deviation of Gaussian noise on the six joints' targets, rad, for more diverse demonstrations;
+            0.005 is harmless. The gripper's target has no noise.
         generator: of the noise; torch's own by default.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A simulated UR5 at a table: pick, push and put-down, seen by a camera in front of it."""
+"""A simulated UR5 at a table: pick, push and put-down, with a camera in front of it."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ class UR5TableEnv(Checked, EnvBase):
     ``expert``/``goal``   [3]         float32, privileged: where its centre has to go (pick: at least as high)
     ===================== =========== =============================================================================
 
-    The reward is one where ``success`` holds. The action ``[7]`` is where the six joints (rad) and the opening (rad)
-    should be at the step's end; the arm turns no faster than a UR5 (180 degrees a second), the fingers open and shut
+    The reward is one where ``success`` holds. The action ``[7]`` is the target of the six joints (rad) and the opening
+    (rad) at the step's end; joint rates are limited as in a UR5 (180 degrees per second), and the fingers open or close
     in half a second. Episodes are truncated after ``max_steps``. Random actions (``rollout`` without a policy) stay
-    near the present pose.
+    near the current pose.
 
-    Each reset draws the object (box or cylinder, size, colour, place, turn), the goal, the home pose, the tilt of the
-    tool (0.3 rad; straight down, wrist 2 would never move) and the expert's pace, all from the environment's own
-    generator: after ``set_seed(n)`` the same actions give the same episodes bit for bit (pixels on the same machine
-    and OpenGL library), with and without pixels.
+    Each reset samples the object (box or cylinder, size, colour, position, rotation), the goal, the home pose, the tilt
+    of the tool (0.3 rad; straight down, wrist 2 would never move) and the expert's pace, all from the environment's own
+    generator: after ``set_seed(n)`` the same actions give the same episodes bit for bit (pixels on the same machine and
+    OpenGL library), with and without pixels.
 
     Success. Pick: the object hangs 8 cm above the table. Push: it stands within 3 cm of the goal. Put-down: that too,
     and the gripper is 7 cm away.
@@ -64,9 +64,9 @@ class UR5TableEnv(Checked, EnvBase):
     that is one step late, joints with friction that stand up to 0.9 degrees from where they were commanded. It shows
     whether a filter survives a change of domain; it does not show how it would do on a particular real robot.
 
-    Pictures need OpenGL, opened at the first picture: EGL if neither ``MUJOCO_GL`` nor a display is set (Debian
-    packages libegl1 and libgl1-mesa-dri), or ``MUJOCO_GL=osmesa`` (libosmesa6). ``close()`` frees it. In a
-    ParallelEnv, spawn the workers (torchrl's default); with forked ones OpenGL hangs.
+    Images need OpenGL, which is opened at the first image: EGL if neither ``MUJOCO_GL`` nor a display is set (Debian
+    packages libegl1 and libgl1-mesa-dri), or ``MUJOCO_GL=osmesa`` (libosmesa6). ``close()`` frees it. In a ParallelEnv,
+    spawn the workers (torchrl's default); with forked ones OpenGL hangs.
 
     Args:
         task: ``"pick"``, ``"push"`` or ``"put_down"``.
@@ -74,11 +74,11 @@ class UR5TableEnv(Checked, EnvBase):
         size: (H, W) of the pixels.
         from_pixels: whether to emit pixels.
         pixels_dtype: ``torch.float32``, in [0, 1], or ``torch.uint8``.
-        render_at: the steps to draw (0 is the reset), for data sets that want few frames of many episodes: all if
-            None, those in a collection, or so many random ones, drawn again at each reset. An attribute too.
-        max_steps: length of an episode. The expert's way takes 320 to 345 steps, however long the episode.
+        render_at: the steps to render (0 is the reset), for data sets with few frames of many episodes: all if None,
+            those in a collection, or a number of random ones, sampled at each reset. Also an attribute.
+        max_steps: length of an episode. The expert needs 320 to 345 steps.
         seed: by default drawn from torch's generator.
-        device: of all that is emitted.
+        device: of all outputs.
 
     Raises:
         ValueError: for an unknown task, domain or type of pixels.
@@ -205,7 +205,7 @@ class UR5TableEnv(Checked, EnvBase):
         return TensorDict(out, device=self.device)
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Writes a random action within 3 degrees of where the joints were last sent, from torch's generator."""
+        """Writes a random action within 3 degrees of the last action, from torch's generator."""
         near = torch.from_numpy(self._scene.target).float() + 0.05 * (2 * torch.rand(7) - 1)
         tensordict = TensorDict(device=self.device) if tensordict is None else tensordict
         return tensordict.set("action", self.action_spec.project(near.to(self.action_spec.device)))
@@ -213,17 +213,17 @@ class UR5TableEnv(Checked, EnvBase):
     # ------------------------------------------------------------------------------------------------ the pictures
 
     def render_state(self, state: Tensor, *, ghosts: Tensor | None = None, scenery: bool = True) -> Tensor:
-        """Draws the arm as a state has it, e.g. a belief's mean, with the object where it is now.
+        """Renders the arm at a state, e.g. a belief's mean, with the object at its current position.
 
         The domain's textures, light, camera and lens apply, its blur, noise and delay do not.
 
         Args:
-            state: ``[*N, S]``; the first seven are J1..J7 in rad, the rest is not read.
+            state: ``[*N, S]``; the first seven are J1..J7 in rad, the others are ignored.
             ghosts: ``[*N, G, S]``, e.g. an ensemble's members: G further arms, translucent and orange.
-            scenery: ``False`` leaves out object and goal, of which a belief in the arm says nothing.
+            scenery: ``False`` omits object and goal, which are not part of a belief about the arm.
 
         Returns:
-            ``[*N, 3, H, W]``, as ``pixels`` are.
+            ``[*N, 3, H, W]``, in the format of ``pixels``.
 
         Raises:
             ValueError: if the shapes of ``state`` and ``ghosts`` do not fit, or there are some hundred ghosts.
@@ -244,7 +244,7 @@ class UR5TableEnv(Checked, EnvBase):
         return torch.stack(list(map(self._tensor, pictures))).reshape(*state.shape[:-1], 3, *self.size).to(state.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Frees the renderer; the next picture would open it again."""
+        """Frees the renderer; it is opened again for the next image."""
         renderer, self._renderer = self.__dict__.get("_renderer"), None
         if renderer is not None:
             renderer.close()

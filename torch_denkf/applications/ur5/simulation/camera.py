@@ -1,4 +1,4 @@
-"""Camera model: lens distortion, motion blur and sensor noise of a rendered picture."""
+"""Camera model: lens distortion, motion blur and sensor noise of a rendered image."""
 
 from __future__ import annotations
 

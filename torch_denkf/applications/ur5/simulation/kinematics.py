@@ -18,7 +18,7 @@ NODES = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 6))
 
 
 class Unreachable(ValueError):
-    """No joints bring the tool to the pose that was asked for."""
+    """Raised if a pose or path is out of the arm's reach."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ def tool_down(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
 def inverse_kinematics(
     scene: UR5Scene, position: np.ndarray, rotation: np.ndarray, start: np.ndarray, *, iterations: int = 60
 ) -> np.ndarray:
-    """Joints ``[6]`` that bring the pinch point to a pose: damped least squares on the site's Jacobian.
+    """Returns joints ``[6]`` that bring the pinch point to a pose: damped least squares on the site's Jacobian.
 
     Args:
         scene: whose ``scratch`` data is used.

@@ -1,4 +1,4 @@
-"""Names of the UR5 table's tasks and of the places where it stands, and its clock: what data sets know of it."""
+"""Names of the UR5 table's tasks and domains, and its time step."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ SUBSTEPS, CHUNKS = 20, 4  # the targets are interpolated between control steps, 
 
 
 class UR5Scene:
-    """Model and data of the table, with the indices of what the environment reads and sets.
+    """Model and data of the table, with the indices that the environment reads and sets.
 
     Attributes:
         model: ``mujoco.MjModel``.

@@ -1,7 +1,7 @@
 """Entries that are damaged and fed to what reads them: readings, masks, beliefs, noises, points of spaces, logs.
 
 A source is what reads them in one way: a filter that steps, takes a sequence or sits in an environment, a smoother, or
-what scores a filter. What is right is the result of other entries: of the sound ones, or of those with a mask.
+what scores a filter. The expected result is that of the undamaged or masked entries.
 """
 
 from __future__ import annotations
@@ -20,18 +20,13 @@ from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders import legged
 from benchmarks.reliability.damage import INF, NAN, Change, put, spoiled
 from benchmarks.reliability.soaks.steps import EXACT, SAMPLED
 from benchmarks.reliability.target import Source, Target
 from tests.borders.around_filters import iterated, particles
-from tests.diagnosis.noises_for_tests import Given, attitude, filter_of, sound_frames
 from tests.filters.composed import ReplayedFrames
 from tests.filters.factories import linear_denkf, linear_kalman, toy_denkf
-from tests.filters.test_hidden_numbers import SPACES, make
-from torch_denkf.diagnosis import evaluate
 from torch_denkf.filters import Filter
-from torch_denkf.functional.manifolds import Circle, Euclidean, Product, places_of
 from torch_denkf.imperfect import RejectReadings
 from torch_denkf.smoothers import EnKS, EnRTS, FixedLag, ParticleSmoother, RTSSmoother
 from torch_denkf.transforms import DEnKFTransform
@@ -56,7 +51,7 @@ def step(filter: Filter, frames: TensorDict, front: Front) -> TensorDict:
 
 
 def sequence(filter: Any, frames: TensorDict, front: Front) -> TensorDict:
-    """Filters, or smooths, a sequence."""
+    """Filters or smooths a sequence."""
     smoothed = [key for key in getattr(filter, "out_keys", ()) if key[0] == "smoothed"]
     keys = getattr(filter, "smoothed_keys", None) or smoothed or filter.belief_keys
     return filter.sequence(front(frames.copy())).select(*keys)
@@ -81,7 +76,7 @@ def fed(
     way: str,
     front: Front = lambda frames: frames,
 ) -> Source:
-    """Frames, and a filter that reads them in one way; a warning of a NaN in a sequence is as good as an error."""
+    """Runs a filter on frames in one way; a warning of NaN in a sequence counts as an error."""
 
     def read(rows: TensorDict, *, double: bool = False) -> TensorDict:
         torch.manual_seed(0)
@@ -95,7 +90,7 @@ def fed(
 
 
 def both(first: Change, then: Change) -> Change:
-    """One change after another."""
+    """Applies one change after another."""
 
     def change(frames: TensorDict) -> TensorDict:
         for one in (first, then):
@@ -107,7 +102,7 @@ def both(first: Change, then: Change) -> Change:
 
 
 def unobserved(*at: Any, width: int = 0) -> Change:
-    """A mask that is False in a place; of so many components, which then have masks of their own."""
+    """Returns a mask that is False in a place; of so many components, which then have masks of their own."""
 
     def change(frames: TensorDict) -> None:
         mask = frames["observed"]
@@ -189,7 +184,7 @@ WIDE_MASK = d.Wrong({"too wide": lambda mask: mask.expand(*mask.shape[:-1], 5)})
 
 
 def large(source: Source, change: Change, result: TensorDict) -> bool:
-    """Right where a reading is treated as missing, or all is finite and as in double precision."""
+    """Tells whether a reading is treated as missing, or all is finite and as in double precision."""
     if source.like(unobserved(*AT))(result):
         return True
 
@@ -207,7 +202,7 @@ def large(source: Source, change: Change, result: TensorDict) -> bool:
 
 
 def goes_on(source: Source, width: int, change: Change, result: TensorDict) -> bool:
-    """Right where only the row that is damaged is as if it had not been observed, or computed right."""
+    """Tells whether only the row that is damaged is as if it had not been observed, or computed right."""
     rows, near = [row for row in range(B) if row != AT[0]], {"rtol": 1e-5, "atol": 1e-5}
     hides = [unobserved(*AT)] + [unobserved(*AT, 0, width=width)] * (width == 2)  # a sensor's is hidden as a whole
     hidden = any(d.same(result[AT[0]], source.damaged(hide)[AT[0]], **near) for hide in hides)
@@ -234,7 +229,7 @@ def readings(one: Fed) -> Iterator[Target]:
 
 
 def poke(place: int, value: float) -> Change:
-    """A number in a belief's entry, of the first row."""
+    """Returns a number in a belief's entry, of the first row."""
     return lambda entry: torch.cat([spoiled(place / 41, value)(entry[:1]), entry[1:]])
 
 
@@ -245,7 +240,7 @@ NUMBERS = d.Wrong(
 
 
 def beliefs(one: Fed) -> Iterator[Target]:
-    """Steps from damaged beliefs; right where a filter does not read what is damaged, as an LSTM its last mean."""
+    """Runs steps from damaged beliefs; correct if the filter does not read the damaged entry."""
 
     def made() -> Filter:
         torch.manual_seed(0)
@@ -304,7 +299,7 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], Use]] = {
 
 
 def laid_out(one: Fed, layouts: dict[str, tuple[tuple[str, ...], Use]]) -> Iterator[Target]:
-    """Frames and calls of a wrong layout."""
+    """Yields frames and calls of a wrong layout."""
     for what, (words, use) in layouts.items():
         read = lambda frames, use=use: use(one.make(), frames)  # noqa: E731
         yield Source(one.border, one.frames, read, one.name).target(
@@ -312,7 +307,8 @@ def laid_out(one: Fed, layouts: dict[str, tuple[tuple[str, ...], Use]]) -> Itera
         )
 
 
-def _of_filters() -> Iterator[Target]:
+def targets() -> Iterator[Target]:
+    """Yields all entries of filters and smoothers."""
     for one in (*FILTERS.values(), *SMOOTHERS, *LAGGED):
         yield from readings(one)
     for one in (*FILTERS.values(), *LAGGED):
@@ -331,200 +327,3 @@ def _of_filters() -> Iterator[Target]:
     flags = d.Wrong({"float": Tensor.float, "too wide": lambda value: value.expand(B, T, 3)})
     source = ENSEMBLE.source("sequence")
     yield source.target("is_init", flags.each(partial(put, "is_init")), source.like(), "is_init")
-
-
-# ------------------------------------------------------------------------------------------------------------ spaces
-
-KINDS = ("EKF", "UKF", "etkf", "particles", "fused")
-STEP = 1  # the one of three that is damaged
-
-
-@cache
-def points(name: str) -> TensorDict:
-    """Sound frames ``[T]`` of one run on a space."""
-    space, rng = SPACES[name], torch.Generator().manual_seed(1)
-    start = space.exp(0.3 * torch.randn(space.tangent_dim, generator=rng))
-    data = TensorDict({"start": start.expand(3, -1).clone(), "state": start.expand(3, -1).clone()}, [3])
-    data["pose"] = space.plus(start, 0.2 * torch.randn(3, space.tangent_dim, generator=rng))
-    return data.set("observed", torch.ones(3, space.tangent_dim, dtype=torch.bool))
-
-
-def _longer(name: str) -> Change:
-    """Another length of quaternions, which is the same rotation."""
-
-    def change(reading: Tensor) -> Tensor:
-        factors = torch.ones(SPACES[name].point_dim)
-        for place in places_of(SPACES[name]):
-            if place.space.point_dim > place.space.tangent_dim:
-                factors[place.point.start : place.point.start + 4] = 1.5
-        return spoiled(STEP, factors * reading[STEP])(reading)
-
-    return change
-
-
-def _on_space(kind: str, name: str) -> Iterator[Target]:
-    space, first = SPACES[name], places_of(SPACES[name])[0]
-    rotations = any(place.space.point_dim > place.space.tangent_dim for place in places_of(space))
-    build, frames, pose, mask = partial(make, kind, space), partial(points, name), partial(put, "pose"), "observed"
-    front = lambda on_bad: RejectReadings({"pose": mask}, spaces={"pose": space}, on_bad=on_bad)  # noqa: E731
-    checked = fed("spaces", f"{kind}, {name}", build, frames, "sequence", front("raise"))
-    broken = d.broken(STEP, places=st.tuples(st.just(STEP), st.integers(0, space.point_dim - 1)))
-    zeros = {"zeros": spoiled(STEP, 0.0)} if rotations else {}
-    shapes = d.SHAPES | {"flags": lambda value: value > 0, "a number": lambda value: value[:, :1]}
-    shapes = shapes.without("too narrow") if space.point_dim == 2 else shapes  # that is a number
-    masks = {
-        "too wide": lambda value: torch.cat([value] * 3, -1),
-        "without its last dimension": lambda value: value[:, 0],
-        **({"too narrow": lambda value: value[:, :-1]} if space.tangent_dim > 3 else {}),
-        **({"of a point's numbers": lambda value: torch.ones(3, space.point_dim) > 0} if rotations else {}),
-    }
-    for source in (checked, fed("spaces", f"{kind}, {name}", build, frames, "step")):
-        far = {"1e25": spoiled((STEP, -1), 1e25)} if source is checked else {}
-        yield source.target("reading", (shapes | broken | zeros | far).each(pose), None, "pose")
-        if rotations:
-            yield source.target("same reading", {"longer": pose(_longer(name))}, source.like(near=1e-5), "pose")
-        for what, hidden, numbers in (("a part", first.tangent, first.point), ("all", ALL, ALL)):
-            hide = unobserved(STEP, hidden)
-            wrong = HIDDEN.each(
-                lambda value, hide=hide, numbers=numbers: both(hide, pose(spoiled((STEP, numbers), value)))
-            )
-            yield source.target(f"behind a mask of {what}", wrong, source.like(hide), "pose")
-        yield source.target(mask, d.Wrong(masks).each(partial(put, mask)), None, mask)
-        yield source.target("a mask of numbers", put(mask, Tensor.float), source.like(), mask)
-    rejecting = fed("spaces", f"{kind}, {name}", build, frames, "sequence", front("mask"))
-    part = {f"{value}": spoiled((STEP, 0), value) for value in (NAN, INF, -INF, 1e25)}
-    if first.space.point_dim > first.space.tangent_dim:
-        part["zeros"] = spoiled((STEP, slice(0, 4)), 0.0)
-    lost = first.tangent if first.space.flat is None else slice(0, 1)
-    yield rejecting.target("rejected", d.Wrong(part).each(pose), rejecting.like(unobserved(STEP, lost)), "pose")
-
-
-def _scored(name: str) -> Iterator[Target]:
-    """Truths that are none, of beliefs that are scored."""
-
-    def read(data: TensorDict) -> Any:
-        torch.manual_seed(0)
-        out = evaluate(make("EKF", SPACES[name]), data)
-        return [out.rmse, out.coverage, out.crps, out.nees.mean]
-
-    truths = {
-        "too wide": lambda state: torch.cat([state, state], -1),
-        "without its last dimension": lambda state: state[:, 0],
-        "all NaN": lambda state: state * NAN,
-        "one step": lambda state: state[None].expand(3, 3, -1),
-    }
-    source = Source("spaces", partial(points, name), read, f"evaluate, {name}, ")
-    yield source.target("truth", d.Wrong(truths).each(partial(put, "state")), None, "truth")
-    yield source.target("true states", put("state", d.MISSING), None, "state")
-
-
-def _of_spaces() -> Iterator[Target]:
-    for turn, name in enumerate(SPACES):
-        for kind in dict.fromkeys(("EKF", KINDS[turn % len(KINDS)])):
-            yield from _on_space(kind, name)
-        yield from _scored(name)
-    for what, act in (
-        ("Product", lambda value, folder: Product(Euclidean(1), value)),
-        ("reading_space", lambda value, folder: make("EKF", Euclidean(2), torch.nn.Identity(), value)),
-        ("spaces", lambda value, folder: RejectReadings({"pose": "observed"}, spaces={"pose": value})),
-    ):
-        words = (what, "space", "spaces", "model", "observation")
-        yield Target("spaces", f"no space, {what}", words, act, d.of(None, "SO3", Circle, 3))
-
-
-# ------------------------------------------------------------------------------------------------------------ noises
-
-GAUSSIAN = ("KalmanFilter", "EKF", "UKF", "FusedEKF")
-SAMPLED = ("etkf", "perturbed", "sakov", "particles", "FusedEnsemble")
-SOUND = torch.tensor([[0.5, 0.1], [0.1, 0.3]])
-VARIANCES = d.of(-1.0, -1e30, NAN, INF, others=st.floats(-1e30, -1e-6)).each(
-    lambda value: spoiled(1, value)(SOUND.diagonal())
-)
-#: Matrices ``[[a, b], [c, e]]`` that are no covariance.
-COVARIANCES = d.Wrong(
-    {
-        "a negative variance": (0.5, 0.1, 0.1, -0.02),
-        "all -1": (-1.0, -1.0, -1.0, -1.0),
-        "indefinite": (1.0, 2.0, 2.0, 1.0),
-        "hardly indefinite": (1.0, 1.01, 1.01, 1.0),
-        "one triangle": (1.0, 50.0, 0.0, 1.0),
-        "the other triangle": (1.0, 0.0, 50.0, 1.0),
-        "not symmetric": (1.0, 0.3, 0.2, 1.0),
-        "zero beside a correlation": (0.0, 0.1, 0.1, 1.0),
-        "nan": (0.5, NAN, 0.1, 0.3),
-        "inf": (INF, 0.1, 0.1, 0.3),
-        "mixed units": (1e6, 2.0, 2.0, 1e-6),
-    },
-    d.drawn(st.floats(1.01, 1e6).map(lambda much: (1.0, much, much, 1.0))),
-).each(lambda numbers: torch.tensor(numbers).view(2, 2))
-FAR = d.of(0.0, -1.0, 1e15, 1e30, NAN, INF, others=st.floats(1e18, 3e38) | st.floats(-3e38, -1e18))
-
-
-def _noise(name: str, way: str, key: str, sound: Tensor, wrong: d.Wrong) -> Iterator[Target]:
-    build = partial(filter_of, name, Given("r", ("sensor", "noise")), Given("q", ("forecast", "noise")))
-    frames = lambda: sound_frames().set(key, sound.expand(2, 4, *sound.shape).clone())  # noqa: E731
-    source = fed("noises", name, build, frames, way)
-    changes, hide = wrong.each(lambda value: put(key, spoiled(AT, value))), unobserved(*AT)
-    # An infinite variance is that of a reading that says nothing.
-    nothing = source.like(unobserved(*AT, 1, width=2), 1e-5)
-    rights = {"inf": nothing} if key == "r" and name in SAMPLED else {}
-    what = f"{key.upper()}, {'variances' if sound.ndim == 1 else 'covariance'}"
-    yield source.target(what, changes, None, key, rights=rights)
-    if key == "r":
-        reject = RejectReadings({"observation": "observed"}, noises={"observation": "r"})
-        for how, then in (("hidden", lambda change: both(hide, change)), ("rejected", lambda one: both(one, reject))):
-            yield source.target(f"{what}, {how}", changes.each(then), source.like(hide, 1e-5), key)
-
-
-def _of_noises() -> Iterator[Target]:
-    """R and Q, shown and hidden and rejected; times, quaternions and rates that are none."""
-    for way in ("step", "sequence"):
-        for name in GAUSSIAN + SAMPLED:
-            for key in ("r", "q"):
-                yield from _noise(name, way, key, SOUND.diagonal(), VARIANCES)
-                if name in GAUSSIAN or key == "q":
-                    yield from _noise(name, way, key, SOUND, COVARIANCES)
-        for kind in ("EKF", "etkf"):
-            make_it, rows = (partial(lambda kind, part: attitude(kind)[part], kind, part) for part in (0, 1))
-            source = fed("noises", f"{kind} of an attitude", make_it, rows, way)
-            for key in ("y", "dt", "gyro"):
-                changes = FAR.each(lambda value, key=key: put(key, spoiled((1, 1), value)))
-                yield source.target(key, changes, d.finite, key)
-
-
-# ----------------------------------------------------------------------------------------------------- legged robots
-
-_LOG = d.broken(0, 2, places=st.tuples(st.just(0), st.integers(0, legged.T - 1), st.integers(0, 2)))
-_LOG = d.SHAPES.but("a dimension more") | _LOG | {"first row nan": spoiled((0, 0, 0), NAN)}
-_FLAGS = d.SHAPES.but("a dimension more") | MASKS.but("without its last dimension")
-_FLAGS |= {"nan": lambda mask: mask.float() * NAN}
-_TIMES = d.SHAPES.but("a dimension more", "too narrow")
-_TIMES |= d.of(NAN, INF, 0.0, -0.01).each(lambda value: spoiled((0, 2, 0), value))
-READ = {**dict.fromkeys(("imu", "joints", "joint_rates"), _LOG), "contact": _FLAGS, "dt": _TIMES}
-
-
-def _of_robots() -> Iterator[Target]:
-    """Returns readings of filters of legged robots, rows that networks learn from, and arguments of environments."""
-    for kind in ("EKF", "UKF", "DEnKF"):
-        source = Source("legged robots", legged.log, partial(legged.run, kind), f"{kind} reads ")
-        right = source.like(near=1e-4)
-        for key, wrong in READ.items():
-            rights = {"float": right, "int64": right}
-            yield source.target(key, wrong.each(partial(put, key)), None, (key, "legs"), rights=rights)
-            if key != "contact":
-                yield source.target(f"{key} in another type", put(key, Tensor.double), right, key)
-    source = Source("legged robots", legged.lasting_log, legged.learned_loss, "LearnedContacts learns from ")
-    learns: dict[Any, d.Wrong] = {("last", key): wrong for key, wrong in READ.items() if key != "dt"}
-    for key, wrong in {("true", "velocity"): _LOG, **learns}.items():
-        rights = {"float": source.like(), "int64": source.like()}
-        yield source.target("/".join(key), wrong.each(partial(put, key)), None, key[-1], rights=rights)
-    wrong = d.SHAPES.but("a dimension more", "without its last dimension").each(partial(put, "action"))
-    wrong |= {f"{value}": put("action", lambda action, value=value: action + value) for value in (NAN, INF)}
-    act = Source("legged robots", legged.standing, legged.acted, "LeggedEnv takes ")
-    yield act.target("an action", wrong, None, "action")
-
-
-def targets() -> Iterator[Target]:
-    """All that is read, entry by entry."""
-    for kind in (_of_filters, _of_spaces, _of_noises, _of_robots):
-        yield from kind()

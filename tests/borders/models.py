@@ -1,4 +1,4 @@
-"""Files of models: checkpoints, and trainings that go on from them; trained filters in folders; packaged steps."""
+"""Files of models: checkpoints, and trainings that continue from them; trained filters in folders; packaged steps."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from safetensors.torch import load_file
 from tensordict import TensorDict
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.recorded import made
 from benchmarks.reliability.damage import MISSING, NAN, put, same, written
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.hostile import PICKLES, archive, members_of, npz_of_zeros
-from benchmarks.reliability.target import Source, Target
+from benchmarks.reliability.target import Source, Subject, Target, targets_of
+from tests.borders.folders import made
 from tests.filters.factories import linear_kalman
 from tests.training.problem import make_trainer
 from torch_denkf import _registered
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
+from torch_denkf.applications.reacher import reacher
 from torch_denkf.deployment import export_step, load_step
 from torch_denkf.deployment.folder import described
-from torch_denkf.pretrained import from_pretrained
+from torch_denkf.pretrained import from_pretrained, save_pretrained
+from torch_denkf.training import FilterTrainer, Stage
 from torch_denkf.training.checkpoint import read_checkpoint
 
 HOSTILE = d.Wrong({what: d.instead(write) for what, write in PICKLES.items()})
@@ -143,7 +145,7 @@ SETTINGS: dict[str, dict[str, d.Wrong]] = {
     },
     "car-odometry": {
         **CAR,
-        **{name: CAR[name].but("a matrix") for name in ("velocity_std", "velocity_mean")},
+        **{name: CAR[name].but("a matrix", "complex") for name in ("velocity_std", "velocity_mean")},
         "features": d.COUNT | {"others": 8},
     },
 }
@@ -152,6 +154,15 @@ CHANGES: dict[str, d.Change] = {
     "a weight more": lambda tensors: {**tensors, "more": torch.ones(2)},
     "no weights": lambda tensors: {},
     "a weight of whole numbers": lambda tensors: {name: value.long() for name, value in tensors.items()},
+}
+#: Changes of a description by hand.
+EDITED: dict[str, d.Change] = {
+    "another setting": put(("settings", "ensemble_size"), 3),
+    "another seed": put(("training", "seed"), 1),
+    "another version": put(("versions", "torch"), "1.0"),
+    "one entry more": put("note", "better"),
+    **{f"without {name}": put(name, MISSING) for name in ("versions", "checksum")},
+    "a checksum of numbers": put("checksum", 3),
 }
 HEADERS = d.of(0, 1 << 40, (1 << 63) + 5).each(
     lambda size: signed(written(lambda data: struct.pack("<Q", size) + data[8:]))
@@ -169,6 +180,7 @@ def _of_pretrained(name: str) -> Iterator[Target]:
         yield folder.target(f"{file} in its place", d.PLACES, file=file, within=4)
     known, loose = ("format", "builder", "settings", "sha256"), lambda place: place[0] == "settings"
     yield from folder.document(CONFIG, right, skip=lambda place: place[0] not in known, loose=loose, then=signed)
+    yield folder.target("description", d.Wrong(EDITED).each(edited), None, "checksum", CONFIG)
     for setting, values in SETTINGS[name].items():
         wrong = values.each(lambda value, setting=setting: signed(edited(put(("settings", setting), value))))
         yield folder.target(setting, wrong, None, (CONFIG, setting), CONFIG)
@@ -202,7 +214,7 @@ def _called(folder: Path, entries: dict[str, Any] | None = None) -> Any:
 
 
 def _as_by_hand(result: Any) -> bool:
-    """Right where the step returns what the filter's own does."""
+    """Tells whether the step returns what the filter's own does."""
     out = linear_kalman().step(TensorDict({tuple(name.split(".")): value for name, value in ENTRIES.items()}))
     expected = {f"belief.{name}": out["belief", name] for name in ("mean", "cov", "var")}
     return same({name: result[name] for name in expected}, expected, atol=1e-5)
@@ -269,10 +281,87 @@ def _of_packages() -> Iterator[Target]:
     yield called.target("without entries", dict.clear, None, ("observation", "entries"), needs=graph)
 
 
+# -------------------------------------------------------------------------------------------------------- arguments
+
+
+def _trained(out: Any = "out", **settings: Any) -> Any:
+    Path("file").touch()
+    return make_trainer(Path(out), **{"updates": 1, "progress": False, **settings}).fit()
+
+
+def _staged(**given: Any) -> Any:
+    net = torch.nn.Linear(1, 1)
+
+    def sample(generator: torch.Generator, length: int | None) -> TensorDict:
+        return TensorDict({"x": torch.rand(8, 1, generator=generator)}, [8])
+
+    loss = lambda batch: {"loss_fit": net(batch["x"]).square().mean()}  # noqa: E731
+    stage = Stage(**{"name": "fit", "loss": loss, "sample": sample, "updates": 2, **given})
+    return FilterTrainer(net, [stage], out=Path("out"), device="cpu", progress=False).fit()
+
+
+def _training() -> Iterator[Subject]:
+    settings = {
+        **dict.fromkeys(("updates", "validate_every", "save_every", "log_every"), d.of("x", -3, 1.5, 0)),
+        "max_skipped": d.of("x", -3),
+        "seed": d.of("x", -3, 1.5),
+        "keep": d.of("worst", 3),
+        "monitor": d.of("beauty"),
+        "loggers": d.of(("paper",)),
+        "device": d.of("abacus", "cuda:77"),
+        "out": d.of("file"),
+    }
+    stage = {
+        "name": d.of("../x", "", 3),
+        "updates": d.COUNT,
+        "lr": d.POSITIVE,
+        "weight_decay": d.NOT_NEGATIVE.but("inf"),
+        "schedule": d.of("weekly", 3),
+        "clip": d.POSITIVE.but("inf"),
+        "lengths": d.of({5: 4}, {0: -4}, "x"),
+    }
+    yield Subject(_trained, wrong=settings, also={"loggers": ("logger",), "out": ("file",)}, name="FilterTrainer")
+    yield Subject(_staged, wrong=stage, also={"name": ("stage's name",)}, name="Stage")
+
+
+def _saved(**given: Any) -> Any:
+    given = {"builder": reacher, "settings": {}, **given}
+    given = {name: value for name, value in given.items() if value is not None}
+    return save_pretrained(torch.nn.Linear(2, 2), "folder", **given)
+
+
+def _pretrained() -> Iterator[Subject]:
+    objects = {"a": object()}
+    saved = {"builder": d.of(None), "settings": d.of(objects, {"a": NAN}, "x"), "training": d.of(objects)}
+    yield Subject(_saved, wrong=saved, name="save_pretrained")
+
+
+def _exported(path: str = "step.pt2", **given: Any) -> Any:
+    Path("file").touch()
+    settings = {"filter": linear_kalman(), "example": TensorDict({"observation": torch.ones(2)}), **given}
+    return export_step(**settings, path=Path.cwd() / path, compiled=False)
+
+
+def _packages() -> Iterator[Subject]:
+    wrong = {
+        "path": d.of("step.zip", "file/step.pt2", "/dev/full/step.pt2"),
+        "out_keys": d.of(["nothing"]),
+        "example": d.Wrong({"without a reading": TensorDict({}), "nothing": None}),
+        "filter": d.of(torch.nn.Linear(2, 2)),
+    }
+    words = {"path": ("pt2", "file", "/dev/full"), "out_keys": ("nothing", "write"), "example": ("observation",)}
+    yield Subject(_exported, wrong=wrong, also=words, name="export_step")
+
+
 def targets() -> Iterator[Target]:
-    """All files of models."""
+    """Yields all files and arguments."""
     npz_of_zeros(1 << 30)  # here, not in each case's process
     yield from _of_checkpoints()
     for name in LOADERS:
         yield from _of_pretrained(name)
     yield from _of_packages()
+    for border, subjects in {"training": _training, "pretrained": _pretrained, "packages": _packages}.items():
+        yield from targets_of(border, *subjects())
+    names = d.of("walker", "../../etc", "/etc", "", "a\0b", 3)
+    also = {"name_or_folder": ("config.json", "car-odometry, imu, quadruped, reacher, ur5-table")}
+    yield from targets_of("pretrained", Subject(from_pretrained, wrong={"name_or_folder": names}, also=also), said=True)

@@ -1,4 +1,4 @@
-"""Logs whose files are sound and whose numbers are not: times of another clock, fixes that repeat, numbers too large.
+"""Logs whose files are valid and whose values are not: times of another clock, fixes that repeat, numbers too large.
 
 What is wrong with them is a warning or an error, which names the file or sensor; warnings are raised here.
 """
@@ -18,11 +18,11 @@ import torch
 from hypothesis import strategies as st
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders.recorded import ALL_ROWS, made
 from benchmarks.reliability.damage import INF, NAN, put
 from benchmarks.reliability.documents import edited
 from benchmarks.reliability.target import Source, Subject, Target, targets_of
-from tests.data.lerobot.lerobot_folder import write_version_2, write_version_3
+from tests.borders.folders import ALL_ROWS, made
+from tests.data.lerobot.lerobot_folder import pictures, write_version_2, write_version_3, write_video
 from tests.data.recordings.own_files import SIZE, write_csv, write_images
 from torch_denkf.data import Images, LeRobotReplay, Recording, RecordingReplay, Table
 from torch_denkf.fusion import message_rows
@@ -44,12 +44,12 @@ def told(act: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def target(name: str, words: tuple[str, ...], act: Callable[..., Any], wrong: d.Wrong, right: Any = None) -> Target:
-    """Values that a log is made of."""
+    """Returns values that a log is made of."""
     return Target("logs", name, words, told(act), wrong, right)
 
 
 def replayed(folder: Path, streams: dict[str, dict[str, Any]], **columns: np.ndarray) -> Any:
-    """Rows of a table, of which streams take columns."""
+    """Returns rows of a table, of which streams take columns."""
     file = write_csv(folder / "run.csv", **columns)
     tables = {name: Table(file, **options) for name, options in streams.items()}
     return RecordingReplay(Recording(**tables), split="all", cache=None)[:]
@@ -68,7 +68,7 @@ def moved(place: int | slice, by: float) -> d.Change:
 
 
 def bursts(of: int) -> d.Change:
-    """Times at which packets of so many readings come."""
+    """Returns times at which packets of so many readings come."""
     number = np.arange(ROWS)
     return lambda times: times[number // of * of] - 2e-4 * (of - 1 - number % of)
 
@@ -150,7 +150,7 @@ def _held(streams: dict[str, dict[str, Any]]) -> Callable[[int, Path], Any]:
 
 
 def _dropped(result: Any) -> bool:
-    """Right where a fix counts once, in the row in which it comes."""
+    """Tells whether a fix counts once, in the row in which it comes."""
     fix = result["gps"].flatten()
     new = torch.cat([torch.ones(1, dtype=torch.bool), fix.diff() != 0])
     return len(result) == ROWS and bool((result["gps_observed"].flatten() == new).all())
@@ -215,7 +215,7 @@ def _of_messages() -> Iterator[Target]:
 
 @told
 def read(root: Path, **options: Any) -> Any:
-    """All rows, as a user reads them; warnings are errors."""
+    """Returns all rows, as a user reads them; warnings are errors."""
     return LeRobotReplay(root, **{"size": (12, 16), **ALL_ROWS, **options})[:]
 
 
@@ -241,7 +241,16 @@ def _lost(pattern: str) -> d.Change:
     return lambda root: [file.unlink() for file in sorted(root.glob(pattern))[1:]]
 
 
+VIDEO = "videos/chunk-000/observation.images.top/episode_000001.mkv"
 INFO, EPISODES = "meta/info.json", "meta/episodes.jsonl"
+DATA = "data/chunk-000/episode_000000.parquet"
+
+
+def _half_the_fps(root: Path) -> None:
+    edited(put(("timestamp", 7), NAN))(root / DATA)
+    edited(put("fps", 5))(root / INFO)
+
+
 LOST = {"videos": _lost("videos/**/*.mkv"), "tables": _lost("data/**/*.parquet")}
 #: A changed file, and the word that tells of it.
 CONTRADICTIONS: dict[str, tuple[str, d.Change, str]] = {
@@ -249,11 +258,18 @@ CONTRADICTIONS: dict[str, tuple[str, d.Change, str]] = {
     "an episode of another length": (EPISODES, edited(put((1, "length"), 5)), "metadata"),
     "twice the fps": (INFO, edited(put("fps", 20)), "fps"),
     "half the fps": (INFO, edited(put("fps", 5)), "fps"),
+    "1.3 times the fps": (INFO, edited(put("fps", 13)), "fps"),
     "more episodes in all": (INFO, edited(put("total_episodes", 50)), "total_episodes"),
     "more frames in all": (INFO, edited(put("total_frames", 5000)), "total_frames"),
     "totals of text": (INFO, edited(put("total_episodes", "many")), "total_episodes"),
     "actions": (INFO, _renamed("actions"), "actions"),
     "commands": (INFO, _renamed("observation.command"), "observation.command"),
+    "a video of another size": (
+        VIDEO,
+        lambda file: write_video(file, pictures(1, 9, (24, 32)), "FFV1"),
+        Path(VIDEO).name,
+    ),
+    "half the fps, and a stamp of nan": ("", _half_the_fps, "fps"),
     "videos that are missing": ("", LOST["videos"], "episodes"),
     "tables that are missing": ("", LOST["tables"], "episodes"),
 }
@@ -264,22 +280,25 @@ CHOICES = {
 
 
 def _whole(result: Any) -> bool:
-    """Right where the episodes that are there are read: the first one."""
+    """Tells whether the episodes that are there are read: the first one."""
     return len(result) == 40 and bool(result["observed"].all())
 
 
 def _of_recordings() -> Iterator[Target]:
     for what, (file, change, word) in CONTRADICTIONS.items():
         yield ROBOT.target(what, change, None, word, file)
+    yield ROBOT.target("a tenth more fps", edited(put("fps", 11)), ROBOT.like(near=1e-6), "fps", INFO)
+    none, newer = edited(put(("length", 1), 0)), "meta/episodes/chunk-000/file-000.parquet"
+    yield NEWER.target("an episode of no length", none, None, "metadata", newer)
     yield ROBOT.target("episodes that are whole", LOST, _whole, "episodes", options={"episodes": [0]})
     large = LARGE.but("(1.0, 1e-07)").each(_large_joints)
-    yield ROBOT.target("large numbers of joints", large, None, "origin", "data/chunk-000/episode_000000.parquet")
+    yield ROBOT.target("large numbers of joints", large, None, "origin", DATA)
     for source, name in ((ROBOT, "version 2"), (NEWER, "version 3")):
         replay = source.arguments(f"LeRobotReplay of {name}", wrong=CHOICES)
         yield from targets_of("logs", replay, needs=source.sound)
 
 
 def targets() -> Iterator[Target]:
-    """Times, numbers, repeats, what drives, single messages, and recordings that contradict themselves."""
+    """Yields times, numbers, repeats, what drives, single messages, and recordings that contradict themselves."""
     for kind in (_of_numbers, _of_messages, _of_recordings):
         yield from kind()

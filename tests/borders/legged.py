@@ -10,13 +10,15 @@ from typing import Any
 
 import mujoco
 import torch
+from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.damage import NAN
-from benchmarks.reliability.target import Subject, Target, targets_of
+from benchmarks.reliability.damage import INF, NAN, put, spoiled
+from benchmarks.reliability.target import Source, Subject, Target, targets_of
+from tests.borders.readings import MASKS
 from torch_denkf.applications.legged import (
     LearnedContacts,
     LeggedErrors,
@@ -46,7 +48,7 @@ _ROBOT = f"""<mujoco><option timestep=".0025"/><worldbody><geom type="plane" siz
 
 @cache
 def model() -> mujoco.MjModel:
-    """A robot of two legs, each with a hinge and a slide."""
+    """Returns a robot of two legs, each with a hinge and a slide."""
     return mujoco.MjModel.from_xml_string(_ROBOT)
 
 
@@ -76,7 +78,7 @@ def run(kind: str, rows: TensorDict) -> TensorDict:
 
 
 def filtered(filter: Any, rows: TensorDict | None = None) -> TensorDict:
-    """Beliefs of a log, behind a rejection that raises."""
+    """Returns beliefs of a log, behind a rejection that raises."""
     torch.manual_seed(0)
     readings = dict.fromkeys(("imu", "joints", "joint_rates"), "contact")
     with torch.no_grad():
@@ -85,7 +87,7 @@ def filtered(filter: Any, rows: TensorDict | None = None) -> TensorDict:
 
 
 def learned_loss(rows: TensorDict) -> Tensor:
-    """A loss of a network of contacts, whose gradients are taken."""
+    """Returns a loss of a network of contacts, whose gradients are taken."""
     torch.manual_seed(0)
     loss = LearnedContacts(model(), **NAMES, rows=2, num_cells=(4,)).loss(rows)
     loss.backward()
@@ -102,6 +104,38 @@ def acted(row: TensorDict) -> TensorDict:
     env = LeggedEnv(model(), **NAMES)
     env.reset()
     return env.step(row)["next"]
+
+
+# ---------------------------------------------------------------------------------------------------------- entries
+
+_LOG = d.broken(0, 2, places=st.tuples(st.just(0), st.integers(0, T - 1), st.integers(0, 2)))
+_LOG = d.SHAPES.but("a dimension more") | _LOG | {"first row nan": spoiled((0, 0, 0), NAN)}
+_FLAGS = d.SHAPES.but("a dimension more") | MASKS.but("without its last dimension")
+_FLAGS |= {"nan": lambda mask: mask.float() * NAN}
+_TIMES = d.SHAPES.but("a dimension more", "too narrow")
+_TIMES |= d.of(NAN, INF, 0.0, -0.01).each(lambda value: spoiled((0, 2, 0), value))
+READ = {**dict.fromkeys(("imu", "joints", "joint_rates"), _LOG), "contact": _FLAGS, "dt": _TIMES}
+
+
+def _entries() -> Iterator[Target]:
+    """Returns readings of filters of legged robots, rows that networks learn from, and arguments of environments."""
+    for kind in ("EKF", "UKF", "DEnKF"):
+        source = Source("legged robots", log, partial(run, kind), f"{kind} reads ")
+        right = source.like(near=1e-4)
+        for key, wrong in READ.items():
+            rights = {"float": right, "int64": right}
+            yield source.target(key, wrong.each(partial(put, key)), None, (key, "legs"), rights=rights)
+            if key != "contact":
+                yield source.target(f"{key} in another type", put(key, Tensor.double), right, key)
+    source = Source("legged robots", lasting_log, learned_loss, "LearnedContacts learns from ")
+    learns: dict[Any, d.Wrong] = {("last", key): wrong for key, wrong in READ.items() if key != "dt"}
+    for key, wrong in {("true", "velocity"): _LOG, **learns}.items():
+        rights = {"float": source.like(), "int64": source.like()}
+        yield source.target("/".join(key), wrong.each(partial(put, key)), None, key[-1], rights=rights)
+    wrong = d.SHAPES.but("a dimension more", "without its last dimension").each(partial(put, "action"))
+    wrong |= {f"{value}": put("action", lambda action, value=value: action + value) for value in (NAN, INF)}
+    act = Source("legged robots", standing, acted, "LeggedEnv takes ")
+    yield act.target("an action", wrong, None, "action")
 
 
 # -------------------------------------------------------------------------------------------------------- arguments
@@ -171,6 +205,7 @@ def _robots() -> Iterator[Subject]:
 
 
 def targets() -> Iterator[Target]:
-    """All arguments."""
+    """Yields all entries and arguments."""
+    yield from _entries()
     yield from targets_of("legged robots", *_subjects())
     yield from targets_of("legged robots", *_robots(), needs=quadruped.quadruped_env, slow=True)

@@ -1,4 +1,4 @@
-"""The words of the command ``denkf``, and the files that they name."""
+"""Arguments of the command ``denkf``, and files that they name."""
 
 from __future__ import annotations
 
@@ -11,26 +11,21 @@ from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 from hypothesis import strategies as st
 
 import torch_denkf.cli.command as command_module
 from benchmarks.reliability import damage as d
-from benchmarks.reliability.borders import models, recorded
-from benchmarks.reliability.borders.recorded import (
-    CALIBRATION_FILE,
-    DEMO,
-    DRIVE,
-    IMAGES,
-    MANIFEST,
-    POSE_FILE,
-    TIME_FILE,
-)
 from benchmarks.reliability.case import Refused
 from benchmarks.reliability.damage import gone, put
 from benchmarks.reliability.documents import WORDS, edited
 from benchmarks.reliability.target import Source, Target
+from tests.borders import kitti, models, ur5
+from tests.borders.folders import made
+from tests.borders.kitti import CALIBRATION_FILE, DRIVE, IMAGES, POSE_FILE, TIME_FILE
+from tests.borders.ur5 import DEMO, MANIFEST
 from torch_denkf.applications.car import track
 from torch_denkf.applications.car.odometry.checkpoint import load_car_filter
 from torch_denkf.applications.car.odometry.paths import write_path
@@ -38,7 +33,7 @@ from torch_denkf.cli.main import commands, main
 
 
 def run(words: Sequence[str]) -> str:
-    """Runs a command: its warnings and what it says, or the error that it ends with.
+    """Runs a command, and returns its warnings and output; raises its error.
 
     Raises:
         Refused: where it ends with a message of argparse, or finds something that is not in order.
@@ -48,10 +43,14 @@ def run(words: Sequence[str]) -> str:
     def again(message: str) -> int:
         raise
 
-    command_module._mistake = again  # of this process alone, as what follows
-    warnings.simplefilter("default")
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        patch.object(command_module, "_mistake", again),
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        warnings.simplefilter("default")
         code = main(list(words))
     if code:
         raise Refused(err.getvalue() + out.getvalue())
@@ -60,8 +59,8 @@ def run(words: Sequence[str]) -> str:
 
 
 def _write(root: Path) -> None:
-    """A drive, demos, a trained filter, and a path that it found."""
-    for source in (recorded.drives(), recorded.demos(), models.FOLDERS["car-odometry"]):
+    """Writes a drive, demos, a trained filter, and an estimated path."""
+    for source in (kitti.drives(), ur5.demos(), models.FOLDERS["car-odometry"]):
         d.copied(source, root)
     frames = [cv2.imread(str(file)) for file in sorted((root / "kitti" / IMAGES).iterdir())]
     found = track(load_car_filter(root / "car-odometry"), frames, (41.7, 41.7, 35.5, 11.5), fps=10.0)
@@ -70,13 +69,13 @@ def _write(root: Path) -> None:
 
 
 def base() -> Path:
-    """Returns the folder in which commands are run; what it is made of is made before."""
-    recorded.drives(), recorded.demos()
+    """Returns the folder in which commands are run, with its files."""
+    kitti.drives(), ur5.demos()
     return _work()
 
 
-_work = recorded.made("work", _write)
-#: Commands that end well.
+_work = made("work", _write)
+#: Commands that succeed.
 COMMANDS: dict[str, str] = {
     "odometry": f"kitti/{IMAGES} --calibration kitti/{CALIBRATION_FILE} --times kitti/{TIME_FILE} "
     "--checkpoint ./car-odometry --out out --no-pictures",
@@ -92,7 +91,7 @@ LEFT_OUT = object()
 
 
 def words(name: str, changes: dict[str, Any]) -> list[str]:
-    """Returns a command's words, with other values of some options; "" is what stands before all options."""
+    """Returns a command's arguments, with other values of some options; "" is the positional one."""
     given: dict[str, list[str]] = {}
     for word in COMMANDS[name].split():
         option = word if word.startswith("--") else next(reversed(given), "")
@@ -105,7 +104,7 @@ def words(name: str, changes: dict[str, Any]) -> list[str]:
 
 
 def called(folder: Path, /, name: str, **changes: Any) -> str:
-    """Returns what a command says in a folder; changes are named as its fields."""
+    """Runs a command in a folder and returns its output; changes are named as its fields."""
     changes = {"" if option == "first" else f"--{option.replace('_', '-')}": value for option, value in changes.items()}
     with contextlib.chdir(folder):
         return run(words(name, changes))
@@ -158,6 +157,8 @@ OWN: dict[tuple[str, str], d.Wrong] = {
     ("plot", "path"): d.of("nowhere", "kitti"),
     ("collect-ur5", "size"): d.of("0", "-4", "4 4 4", "x"),
     ("collect-ur5", "frames"): WHOLE,
+    ("render-kitti", "frames"): AT_LEAST_ONE | d.of("1"),
+    ("render-kitti", "focal"): POSITIVE | d.of("718.856"),
     ("demo", "root"): d.of("kitti"),
     ("demo", "drive"): d.of("town"),
     ("demo", "height"): d.of("x"),
@@ -200,20 +201,20 @@ def _options(name: str) -> Iterator[Target]:
 
 
 def _half_of_the_drive(root: Path) -> None:
-    """A drive of which there are five frames, and as many poses."""
+    """Removes half of a drive: five frames and five poses remain."""
     d.BYTES.named["cut in half"](root / "kitti" / POSE_FILE)
-    for number in range(5, recorded.FRAMES):
+    for number in range(5, kitti.FRAMES):
         gone(root / "kitti" / IMAGES / f"{number:06d}.png")
 
 
 def _as_of_half_the_drive(said: str) -> bool:
-    """Right where images without poses are warned of, and the rest is as of a drive without these images."""
+    """Tells whether images without poses are warned of, and the rest is as of a drive without these images."""
     warning, _, table = said.partition("\n")
     shorter = CALLED["evaluate"].damaged(_half_of_the_drive)
     return "town.txt has 5 poses" in warning and "5 of 10 images" in warning and table == shorter
 
 
-#: What commands read, and options that it takes.
+#: Files that commands read, and the options for them.
 FILES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("odometry", f"kitti/{CALIBRATION_FILE}", {}),
     ("odometry", f"kitti/{TIME_FILE}", {}),
@@ -232,17 +233,17 @@ PATH: dict[str, d.Change] = {
     "only a header": lambda rows: rows[:1],
     "another header": put(0, ["a", "b", "c"]),
 }
-#: What each of three poses may be: three of them are a drive.
+#: Valid changes of each of three poses.
 POSES: dict[str, d.Change] = {
     **{f"{value} in place {place}": put((1, place), value) for value in WORDS.named.values() for place in (0, 3)},
-    **{f"pose 1 {what}": put(1, change) for what, change in recorded.POSES.items() if what != "an empty line"},
+    **{f"pose 1 {what}": put(1, change) for what, change in kitti.POSES.items() if what != "an empty line"},
     "eleven numbers": put((1, 11), d.MISSING),
     "three poses 1e7 m apart": lambda rows: [[*row[:11], str(1e7 * number)] for number, row in enumerate(rows)],
 }
 
 
 def _rights(source: Source, file: str, options: dict[str, Any]) -> Callable[[str, Any], Any]:
-    """Right where a command says word for word what it says of sound files, and warns of nothing.
+    """Tells whether a command prints exactly its output for undamaged files, without warnings.
 
     Nothing depends on the last byte of a table or a description, which ends a line; of calib.txt, rows of other cameras
     may be damaged.
@@ -262,7 +263,7 @@ def _rights(source: Source, file: str, options: dict[str, Any]) -> Callable[[str
 
 
 def targets() -> Iterator[Target]:
-    """All words and files."""
+    """Yields all words and files."""
     for name in COMMANDS:
         yield from _options(name)
     act, no_words = (lambda words, folder: run(words)), d.of(["fly"], ["info", "--loud"])
