@@ -111,7 +111,8 @@ def _of_file(path: Path, **options) -> dict[str, Stream]:
         return found
     full, sparse = sparse_columns(path, options.get("time"))
     others: list[str] = []
-    for group in [each for each in (full, *sparse) if each] or [None]:
+    groups: list[list[str] | None] = [each for each in (full, *sparse) if each]
+    for group in groups or [None]:
         whole = Table(path, group, **options).read()
         others += whole.columns
         for columns in _together(whole):
