@@ -52,6 +52,8 @@ class Log(Command):
             say(f"{name}: {len(one.readings.times)} readings, {one.rate:.3g} Hz: {shown}")
             for text in one.oddities():
                 say(f"  {text}")
+        if others := [name for one in streams.values() for name in one.others]:
+            say(f"in no stream, since they never change, or not with a sensor's: {', '.join(others)}")
         tables = {name: one.readings for name, one in streams.items()}
         delays = delays_between(tables)
         offsets = solved(delays, tables) if delays else {}
@@ -66,7 +68,7 @@ class Log(Command):
             if unit is not None:
                 say(f"  their numbers differ by {ratio:.3g}: {unit} beside {'rad' if unit == 'degrees' else 'm/s'}?")
         for name, offset in offsets.items():
-            if abs(offset.seconds) > 1.96 * offset.std:
+            if offset.sure:
                 say(f"{name}: pass offset={offset.seconds:.2f} to its Table ({1.96 * offset.std:.2f} s either way)")
         if not delays:
             say("no two streams know the same turns or ways, so that delays cannot be found")

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.data.recordings.cart import cart, write_cart
 from tests.real_data import SHARED
 from torch_denkf.applications.robot import robot_model
 from torch_denkf.applications.robot.config import read_config
@@ -189,6 +190,60 @@ def test_a_pose_alone(tmp_path, capsys):
     )
     assert main(["fuse", str(tmp_path / "pose.txt"), "--out", str(tmp_path / "out"), "--steps", "0"]) == 0
     assert "| pose0_pose (position) | x, y, yaw | " in capsys.readouterr().out
+
+
+def fused(folder, capsys, share, *words):
+    """Returns the error of a cart's path with so many outliers, the share of its 90 % intervals, the report."""
+    folder.mkdir()
+    logs, truth = write_cart(folder, *cart(60, share))
+    assert main(["fuse", *logs, "--out", str(folder), *words]) == 0
+    path = np.genfromtxt(folder / "path.csv", delimiter=",", names=True)
+    off = np.c_[[path[name] - np.interp(path["time"], truth[:, 0], truth[:, k]) for k, name in ((1, "x"), (2, "y"))]]
+    held = np.abs(off) < 1.645 * np.c_[[path["std_x"], path["std_y"]]]
+    capsys.readouterr()
+    return np.sqrt(np.square(off).sum(0).mean()), held.mean(), (folder / "report.md").read_text()
+
+
+def test_outliers_of_fixes(tmp_path, capsys):
+    """A tenth of fixes wrong by 3 m, no gyro: as good as without but for the fixes that are lost.
+
+    Intervals may hold more: a log of a minute does not tell noise from drift.
+    """
+    clean, _, report = fused(tmp_path / "clean", capsys, 0.0, "--steps", "1")
+    assert " | 0 | " in report.splitlines()[8]
+    error, held, report = fused(tmp_path / "wrong", capsys, 0.1, "--steps", "1")
+    wrong = cart(60, 0.1)[2].sum()
+    assert f" | {wrong} | " in report.splitlines()[8]
+    assert error < 1.5 * clean
+    assert held > 0.8
+
+
+def test_columns_that_are_not_used(tmp_path, capsys):
+    """Says so, and that no place is known; without any sensor that is an error."""
+    time, _, _, speed, _ = drive(20.0)
+    table = np.c_[time, np.cumsum(speed) * 0.05, speed]
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,position_m,wheel_speed", comments="")
+    assert main(["fuse", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out"), "--steps", "0"]) == 0
+    report, out = (tmp_path / "out/report.md").read_text(), capsys.readouterr().out
+    for text in (report, out):
+        assert "ot used: position_m" in text
+        assert "o fixes: the path has no place to begin at, and drifts; columns of places are latitude and" in text
+    np.savetxt(tmp_path / "log.csv", table[:, :2], delimiter=",", header="t,position_m", comments="")
+    assert main(["fuse", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]) == 2
+    assert "none of the columns ['position_m'] is known: name them latitude" in capsys.readouterr().err
+
+
+def test_a_cart_on_an_axis(tmp_path, capsys):
+    """The column that is always zero is read, and its noise not learned: a variance of zero has no logarithm."""
+    time, _, _, speed, _ = drive(40.0)
+    rng, way = np.random.default_rng(0), np.cumsum(speed) * 0.05
+    table = np.c_[time, way + 0.1 * rng.normal(size=len(time)), 0 * way, speed][::4]
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,x,y,speed", comments="")
+    assert main(["fuse", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out"), "--steps", "1"]) == 0
+    assert "pose0_pose (position) | x, y |" in capsys.readouterr().out
+    path = np.genfromtxt(tmp_path / "out/path.csv", delimiter=",", names=True)
+    assert np.abs(path["x"] - np.interp(path["time"], time, way)).mean() < 0.5
+    assert np.abs(path["y"]).max() < 0.5
 
 
 def test_the_command(tmp_path, capsys):

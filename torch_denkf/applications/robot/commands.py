@@ -46,6 +46,7 @@ class Fuse(Command):
             default_settings,
             drift_settings,
             log_streams,
+            not_used,
             read_log,
             rows_of_log,
             start_of,
@@ -58,8 +59,9 @@ class Fuse(Command):
         check_number("--gap-seconds", self.gap_seconds, above=0)
         streams = log_streams(*self.log)
         model = robot_model(default_settings(streams) if self.config is None else self.config, kind=self.kind)
-        for text in model.unheeded:
-            say(f"not honoured: {text}")
+        unused = [*(f"not honoured: {text}" for text in model.unheeded), *not_used(streams, model.config)]
+        for text in unused:
+            say(text)
         log = read_log(" and ".join(map(str, self.log)), model.config, streams)
         if self.steps:
             model = robot_model(drift_settings(log, model), kind=self.kind)
@@ -90,7 +92,7 @@ class Fuse(Command):
                     f"In {self.gaps} gaps of {self.gap_seconds:g} s, {count} fixes that were hidden: {error:.2f} m off "
                     f"(root mean square), {held:.0%} within the 95 % intervals of a fix."
                 )
-            lines += ["", *sensor_lines(model, log, out), "", *(f"Not honoured: {text}" for text in model.unheeded)]
+            lines += ["", *sensor_lines(model, log, out), "", *(f"{text[0].upper()}{text[1:]}" for text in unused)]
             names = write_path(self.out, model, log, out)
             (self.out / "report.md").write_text("\n".join(lines) + "\n", "utf-8")
             say("\n".join(lines[4:]))

@@ -23,6 +23,8 @@ __all__ = ["Learned", "fix_error", "learn_noises", "scale_of"]
 _HELD_OUT = 4  # every so many segments one is held out
 _MOST = 20  # segments; of a longer log so many are spread over it
 _RATE = 0.3  # of Adam, on logarithms of standard deviations
+_BLIND = 5.0  # s: the longest window if nothing tells turns, and a filter's straight lines are wrong in longer ones
+_SMALLER = 0.1  # of the drift of fixes, with which learning begins if that is likelier: most of it may be white noise
 _LEAST = 1e-3  # of a reading's spread: quantised readings look as if they had no noise
 
 
@@ -56,15 +58,16 @@ def learn_noises(
     The likelihood of each next reading tells little about coloured noise. So the log is cut into segments of three
     windows, each from the filter's belief at that time; fixes of the middle window are hidden, and are to be likely for
     the smoother, with the fix's own noise and drift. A log without fixes is learned by the likelihood of its readings.
-    White noise starts from how much readings differ from the line through their neighbours. In three stages all is
-    learned, each from the beliefs that the one before it leads to; what is kept is the best on held-out segments.
+    White noise starts from how much readings differ from the line through their neighbours, the drift of fixes from
+    what is likelier, as large as it is, or a tenth of it. In three stages all is learned, each from the beliefs that
+    the one before it leads to; what is kept is the best on held-out segments.
 
     Args:
         model: its parameters change.
         rows: of the log ``[T]``, see :func:`~torch_denkf.applications.robot.log.rows_of_log`.
         others: further logs to learn from: the model with the initial belief of each, and its rows.
         steps: of a stage.
-        window: s; at most a sixth of the log.
+        window: s; at most a sixth of the log, and 5 s where nothing tells turns.
         shown: whether progress is.
 
     Raises:
@@ -73,6 +76,8 @@ def learn_noises(
     filter, logs = model.filter, [(model, rows), *others]
     seconds = [float(each["stamp"][-1] - each["stamp"][0]) for _, each in logs]
     window = min(window, min(seconds) / (_HELD_OUT + 2))
+    if not any({STATES.index("yaw"), STATES.index("vyaw")} & set(reads) for reads in model.reads.values()):
+        window = min(window, _BLIND)
     length = min(round(3 * window * len(each) / max(took, 1e-9)) for (_, each), took in zip(logs, seconds, strict=True))
     if length < 3 * _HELD_OUT:
         least = min(len(each) for _, each in logs)
@@ -101,6 +106,8 @@ def learn_noises(
     before, reached, stages, interrupted = None, -torch.inf, [], False
     with progress_bar("learning noises", 3 * (steps + 1), unit=" steps", shown=shown) as bar:
         try:
+            before = _smaller_drift(model, logs, every, window, length)
+            best = [value.detach().clone() for value in every]
             for _ in range(3):
                 cut = [_segments(*each, window, length) for each in logs]
                 train, test = (torch.cat(parts) for parts in zip(*cut, strict=True))
@@ -127,6 +134,32 @@ def learn_noises(
     for hook in hooks:
         hook.remove()
     return Learned(before if before is not None else float("nan"), reached, stages, interrupted)
+
+
+@torch.no_grad()
+def _smaller_drift(
+    model: RobotModel,
+    logs: Sequence[tuple[RobotModel, TensorDict]],
+    parameters: Sequence[Tensor],
+    window: float,
+    length: int,
+) -> float | None:
+    """Makes the drift of fixes smaller where held-out segments are likelier then; returns how likely they were."""
+    if model.drifts is None:
+        return None
+    places = [at - len(STATES) for name in _positions(model) for at in model.reading(name).slow[:2] if at is not None]
+    given, scores = model.drifts.log_std.clone(), []
+    smaller = given.index_add(
+        0, torch.tensor(places, dtype=torch.long), given.new_full([len(places)], math.log(_SMALLER))
+    )
+    for tried in (given, smaller)[: 1 + bool(places)]:
+        model.drifts.log_std.copy_(tried)
+        _load(logs, parameters, parameters)
+        scores.append(float(_likelihood(model, torch.cat([_segments(*each, window, length)[1] for each in logs]))))
+    if scores[-1] <= scores[0]:
+        model.drifts.log_std.copy_(given)
+        _load(logs, parameters, parameters)
+    return scores[0]
 
 
 def _alike(gradient: Tensor, at: Sequence[int]) -> Tensor:
@@ -161,7 +194,7 @@ def _start_from(model: RobotModel, rows: TensorDict, name: str, varies: Tensor) 
         scale = scale_of(model, name)
         start = (white / given)[: len(scale)].log()
         if name in _positions(model):
-            start[:2] = start[:2].mean()
+            start[:2] = start[:2][varies[:2]].mean()  # an axis along which all fixes are zero says nothing
         scale.copy_(torch.where(varies, start, scale))
 
 

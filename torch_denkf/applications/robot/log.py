@@ -14,15 +14,26 @@ from tensordict import TensorDict
 from torch_denkf.applications.robot.config import Config
 from torch_denkf.applications.robot.model import RobotModel
 from torch_denkf.applications.robot.motion import ANGLES, STATES
-from torch_denkf.applications.robot.readings import Seen, from_north, seen_by
+from torch_denkf.applications.robot.readings import Seen, from_north, seen_by, unread
 from torch_denkf.data.recordings.offsets import ClockOffset, Delay, delays_between, solved
+from torch_denkf.data.recordings.outliers import without_outliers
 from torch_denkf.data.recordings.quantities import find
 from torch_denkf.data.recordings.streams import Stream, streams_of
 
-__all__ = ["RobotLog", "default_settings", "drift_settings", "log_streams", "read_log", "rows_of_log", "start_of"]
+__all__ = [
+    "RobotLog",
+    "default_settings",
+    "drift_settings",
+    "log_streams",
+    "not_used",
+    "read_log",
+    "rows_of_log",
+    "start_of",
+]
 
 _RATE = 2.0  # Hz, of rows to learn from
 _SHARE = 0.05  # of a speed, or of a reading's spread: size of a drift before it is learned
+_PLACES = "latitude and longitude, x and y, or east and north"
 _AWAY = 5.0  # m, from the first fix to the one that tells the heading
 
 
@@ -34,11 +45,13 @@ class RobotLog:
         seen: by the name of the sensor.
         offsets: that were found between the streams of the log, and taken out.
         origin: of the local frame, in degrees; ``None`` where there is no latitude.
+        outliers: by sensor of the settings: how many fixes are left out, since they are far from those around them.
     """
 
     seen: Mapping[str, Seen]
     offsets: Mapping[str, ClockOffset]
     origin: tuple[float, float] | None
+    outliers: Mapping[str, int]
 
 
 def log_streams(*files: Path) -> dict[str, Stream]:
@@ -49,7 +62,11 @@ def log_streams(*files: Path) -> dict[str, Stream]:
 
 
 def default_settings(streams: Mapping[str, Stream]) -> dict:
-    """Returns settings for a log without any: in the plane, all sensors that a stream's columns tell."""
+    """Returns settings for a log without any: in the plane, all sensors that a stream's columns tell.
+
+    Raises:
+        ValueError: if they tell none.
+    """
     settings: dict = {"frequency": 10.0, "two_d_mode": True, "initial_estimate_covariance": [10.0] * 2 + [1.0] * 13}
     kinds = {"pose": ("latitude", (0, 1)), "twist": ("speed", (6, 7)), "imu": ("turn rate", (11,))}
     for kind, (what, places) in kinds.items():
@@ -62,7 +79,28 @@ def default_settings(streams: Mapping[str, Stream]) -> dict:
                 read = (*places, 5) if kind == "pose" and turned else places
                 settings[f"{kind}{number}_config"] = [place in read for place in range(15)]
                 number += 1
+    if len(settings) == 3:
+        every = [name for stream in streams.values() for name in (*stream.readings.columns, *stream.others)]
+        raise ValueError(f"none of the columns {every} is known: name them {_PLACES}, speed, heading or yaw_rate")
     return settings
+
+
+def not_used(streams: Mapping[str, Stream], config: Config) -> list[str]:
+    """Says what of a log the settings do not read: topics, columns, and places if there is none."""
+    read: dict[str, list[int]] = {}
+    for sensor in config.sensors:
+        read.setdefault(sensor.topic.strip("/"), []).extend(place for each in sensor.groups.values() for place in each)
+    unused: list[str] = []
+    for name, stream in streams.items():
+        places = read.get(name.strip("/"), [])
+        if stream.table.topic is None:
+            unused += [*unread(stream.readings.columns, places), *stream.others]
+        elif not places:
+            unused.append(name)
+    out = [f"not used: {', '.join(unused)}"] if unused else []
+    if not any({0, 1} & set(places) for places in read.values()):
+        out.append(f"no fixes: the path has no place to begin at, and drifts; columns of places are {_PLACES}")
+    return out
 
 
 def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) -> RobotLog:
@@ -72,11 +110,12 @@ def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) ->
         ValueError: if the log lacks a stream or a column.
     """
     topics = {sensor.name: _found(sensor.topic, streams, file) for sensor in config.sensors}
-    tables = {topic: streams[topic].readings for topic in topics.values()}
+    screened = {topic: without_outliers(streams[topic].readings) for topic in topics.values()}
+    tables = {topic: table for topic, (table, _) in screened.items()}
     delays: list[Delay] = delays_between(tables)
     offsets = solved(delays, tables) if delays else {}
-    # What a delay's interval holds zero of is none; a sensor whose delay is given has that.
-    offsets = {name: one for name, one in offsets.items() if abs(one.seconds) > 1.96 * one.std}
+    # A delay that may be chance is none; a sensor whose delay is given has that.
+    offsets = {name: one for name, one in offsets.items() if one.sure}
     origin = None
     for table in tables.values():
         if origin is None and (places := find(table.columns, "latitude", "longitude")):
@@ -91,7 +130,7 @@ def read_log(file: Path | str, config: Config, streams: Mapping[str, Stream]) ->
         scale = max([abs(each.scale if each.late == topic else 1 / each.scale) for each in ways], default=1.0)
         for group in sensor.groups:
             seen[f"{sensor.name}_{group}"] = seen_by(sensor, group, config, table, origin, scale)
-    return RobotLog(seen, offsets, origin)
+    return RobotLog(seen, offsets, origin, {name: screened[topic][1] for name, topic in topics.items()})
 
 
 def drift_settings(log: RobotLog, model: RobotModel) -> dict:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,13 @@ from torch_denkf.data.earth import to_local
 from torch_denkf.data.recordings.quantities import SPEEDS, find, quantity, speed_unit
 from torch_denkf.data.recordings.tables import Readings
 
-__all__ = ["Seen", "from_north", "seen_by"]
+__all__ = ["Seen", "from_north", "seen_by", "unread"]
 
+#: The states that quantities tell.
+_TOLD = {
+    **dict.fromkeys(("latitude", "longitude", "east", "north", "hdop"), (0, 1)),
+    **{"heading": (5,), "speed": (6, 7), "turn rate": (11,), "acceleration": (12, 13, 14)},
+}
 _ROTATING = 7.0  # rad, or rad/s: beyond are degrees
 _XYZ = ("x", "y", "z")
 _SLIP = 0.1  # m/s: standard deviation of a vehicle's speed sideways and upwards, which is read as zero
@@ -50,6 +55,19 @@ def from_north(name: str) -> bool:
         (True, False, False)
     """
     return bool(re.search("compass|magnetic|true_?heading", name.lower()))
+
+
+def unread(columns: Sequence[str], places: Collection[int]) -> list[str]:
+    """Lists the columns with other than usual names, or of which no state is read.
+
+    Examples:
+        >>> unread(["position_m", "yaw_rate", "ax", "ay", "speed"], [6, 11])
+        ['position_m', 'ax', 'ay']
+    """
+    known = [quantity(name) or name.lower() for name in columns]
+    axes = known.index("acceleration") if "acceleration" in known else len(known)
+    known[axes : axes + 3] = ["acceleration"] * len(known[axes : axes + 3])
+    return [name for name, what in zip(columns, known, strict=True) if not set(_TOLD.get(what, ())) & set(places)]
 
 
 def seen_by(

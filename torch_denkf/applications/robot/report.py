@@ -26,8 +26,9 @@ _BELIEVED = 0.99  # of a reading's distance: beyond, it is none that the noise e
 
 
 def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]:
-    """Returns a table of each sensor's share of accepted readings, bias, delay, noise and drift."""
-    heads = ("sensor", "reads", "readings", "accepted", "bias", "residual", "noise as given", "noise as learned")
+    """Returns a table of each sensor's outliers, share of accepted readings, bias, delay, noise and drift."""
+    heads = ["sensor", "reads", "readings", "outliers", "accepted", "bias", "residual"]
+    heads += ["noise as given", "noise as learned"]
     lines = [f"| {' | '.join(heads)} | drift | offset |", "|" + "---|" * (len(heads) + 2)]
     for sensor in model.config.sensors:
         for group in sensor.groups:
@@ -55,10 +56,9 @@ def sensor_lines(model: RobotModel, log: RobotLog, out: TensorDict) -> list[str]
             cells = [kept, (residual - bias).std(0), said, given * scale, drift]
             texts = ["; ".join(each if isinstance(each, str) else f"{each:.3g}" for each in cell) for cell in cells]
             reads = ", ".join(STATES[place] for place in places)
-            lines.append(
-                f"| {name} ({sensor.topic}) | {reads} | {int(seen.sum())} | {share:.1%} | {' | '.join(texts)} | "
-                f"{offset:+.2f} s |"
-            )
+            far = log.outliers[sensor.name] if 0 in places else 0
+            head = f"| {name} ({sensor.topic}) | {reads} | {int(seen.sum())} | {far} | {share:.1%} |"
+            lines.append(f"{head} {' | '.join(texts)} | {offset:+.2f} s |")
     return lines
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_denkf.data.earth import to_local
+from torch_denkf.data.recordings.outliers import fixes_of, outlying
 from torch_denkf.data.recordings.quantities import find, in_radians, quantity
 from torch_denkf.data.recordings.replay import Recording
 from torch_denkf.data.recordings.tables import Readings, Table
@@ -22,6 +22,7 @@ _SPANS = (1.0, 2.0)  # s: intervals of the compared changes; longer ones average
 _STEP = 0.02  # s: step of the search
 _LEAST = 30  # fewest comparisons
 _AGREE = 0.6  # smallest correlation of two streams with a common quantity
+_NOISY = 0.9  # correlation below which the noise of fixes is much of a short way, as of slow robots
 _BLOCK = 4.0  # spans, after which errors are taken to be independent
 _BETTER = 0.7  # ratio of standard deviations below which the longer span is preferred
 _STEADY = 0.02  # relative variation below which a signal counts as constant
@@ -37,6 +38,11 @@ class ClockOffset(NamedTuple):
 
     seconds: float
     std: float
+
+    @property
+    def sure(self) -> bool:
+        """Returns True beyond three standard deviations: of some streams one is soon beyond two by chance."""
+        return abs(self.seconds) > 3 * self.std
 
 
 class Delay(NamedTuple):
@@ -161,7 +167,8 @@ def delays_between(tables: Mapping[str, Readings], most: float = 5.0) -> list[De
                 best = int(np.argmax(sizes))
                 limit = most / 3**best
                 found = tried[best]
-                if what == "heading" or pair[1].level.ndim == 1:  # not for chords, which are shorter
+                # Chords of curves are shorter than the way, which matters less than much noise.
+                if what == "heading" or pair[1].level.ndim == 1 or sizes[best] < _NOISY:
                     longer = _delay(*pair, what, limit, _SPANS[1])
                     if found is not None and longer is not None:
                         # The variance includes the part of the difference between both spans that their variances do
@@ -218,14 +225,10 @@ def _signals(table: Readings) -> dict[str, _Signal]:
         times, values = times[new], values[new]
     ones, out = np.ones(len(times)), {}
     speed = find(columns, "speed")
-    places = find(columns, "latitude", "longitude")
-    if places:
-        fixes = values[:, places]
-        fixes = to_local(fixes, np.median(fixes, 0))
-    elif places := find(columns, "east", "north"):
-        fixes = values[:, places]
-    if places:
-        out["heading"] = out["way"] = _Signal(times, fixes, ones)
+    fixes = fixes_of(columns, values)
+    if fixes is not None:
+        sound = ~outlying(times, fixes)
+        out["heading"] = out["way"] = _Signal(times[sound], fixes[sound], ones[sound])
     if speed:
         out["way"] = _Signal(times, _integral(times, values[:, speed[0]]), ones)
     if heading := find(columns, "heading"):
@@ -254,6 +257,8 @@ def _delay(
     last = np.append(end, len(end))[end] if corners else end  # one span after the end
     until = np.append(late.times, np.inf)[last]
     begin = np.flatnonzero((late.times > early.times[0] + most) & (until < early.times[-1] - most))
+    took = until[begin] - late.times[begin]
+    begin = begin[took < 2 * np.median(took)] if len(begin) else begin  # across a gap a chord is shorter than a way
     end, last = end[begin], last[begin]
     if len(begin) < _LEAST:
         return None

@@ -13,7 +13,7 @@ from torch_denkf.data.recordings.bags import is_bag, read_topic
 from torch_denkf.data.recordings.stamps import nanoseconds_beside, seconds_of, time_columns
 from torch_denkf.data.recordings.texts import LARGEST, as_number, numbered, read_cells
 
-__all__ = ["Numbers", "Source", "open_source", "read_numbers"]
+__all__ = ["Numbers", "Source", "open_source", "read_numbers", "sparse_columns"]
 
 
 class Source:
@@ -187,7 +187,7 @@ def read_numbers(
     """
     source = open_source(file, columns, topic)
     there = source.names
-    found = [] if timeless else [time] if time is not None else time_columns(there) or _dates(source) or ["time"]
+    found = [] if timeless else _found(source, time)
     missing = [name for name in [*found, *(columns or ())] if name not in there]
     if missing:
         cure = (
@@ -217,13 +217,52 @@ def read_numbers(
     if len(bad):
         row = int(bad[0])
         name = chosen if np.isnan(times[row]) else names[int(np.isnan(values[row]).argmax())]
+        cure = "correct it, or leave the row out: what is missing then counts as not observed"
+        if len(names) > 1 and name in names and source.empty(name)[kept[row]]:
+            cure = (
+                f"columns that are empty in other rows are tables of their own: pass columns=[{name!r}], and the others"
+            )
         raise ValueError(
             f"{source.place(int(kept[row]))}: {name!r} is {source.cell(name, int(kept[row]))!r}, which is no finite "
-            "number; correct it, or leave the row out: what is missing then counts as not observed"
+            f"number; {cure}"
         )
     return Numbers(
         times, chosen or "times", values, names, lambda row: source.place(int(kept[row]) if len(kept) else -1)
     )
+
+
+def sparse_columns(file: Path, time: str | None = None) -> tuple[list[str], list[list[str]]]:
+    """Returns the columns of numbers with one in each row, and groups of those that are empty in the same rows.
+
+    Args:
+        file: of a :class:`~torch_denkf.data.Table`.
+        time: as of :func:`read_numbers`.
+
+    Returns:
+        Two empty lists where no row lacks a number that others have.
+
+    Raises:
+        FileNotFoundError: without the file.
+        ImportError: for Parquet without pyarrow.
+        ValueError: if it cannot be read.
+    """
+    source = open_source(file)
+    empty = {name: source.empty(name) for name in source.names}
+    if not any(one.any() and not one.all() for one in empty.values()):
+        return [], []
+    clock = _found(source, time)
+    clock += [beside for name in clock if (beside := nanoseconds_beside(name, source.names))]
+    groups: dict[bytes, list[str]] = {}
+    for name, one in empty.items():
+        if name not in clock and np.isfinite(source.column(name)).any():
+            groups.setdefault(one.tobytes(), []).append(name)
+    full = groups.pop(bytes(len(one)), [])
+    return full, list(groups.values())
+
+
+def _found(source: Source, time: str | None) -> list[str]:
+    """Lists the columns that may hold the times."""
+    return [time] if time is not None else time_columns(source.names) or _dates(source) or ["time"]
 
 
 def _dates(source: Source) -> list[str]:

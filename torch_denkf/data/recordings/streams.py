@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from torch_denkf.data.recordings.bags import bag_topics, is_bag
+from torch_denkf.data.recordings.outliers import without_outliers
 from torch_denkf.data.recordings.quantities import quantity
+from torch_denkf.data.recordings.sources import sparse_columns
 from torch_denkf.data.recordings.tables import Readings, Table
 from torch_denkf.diagnosis.logs import repeats
 
@@ -18,6 +20,7 @@ _TOGETHER = 0.8  # share of common changes from which two columns belong to the 
 _GAP = 10  # median steps
 _BURST = 0.1  # median steps
 _NAMES = {"latitude": "gps", "east": "position", "turn rate": "imu", "acceleration": "imu", "speed": "speed"}
+_PARTNERS = {"latitude": "longitude", "longitude": "latitude", "east": "north", "north": "east"}
 _TURNS, _GRAVITY = 7.0, (5.0, 20.0)  # rad/s beyond any robot; range of the median acceleration's norm, m/s^2
 
 
@@ -28,11 +31,13 @@ class Stream(NamedTuple):
         table: table that reads it.
         readings: readings of the table.
         repeated: share of rows that repeat a reading.
+        others: columns of numbers of its file that are in no stream; with the first stream of the file.
     """
 
     table: Table
     readings: Readings
     repeated: float
+    others: tuple[str, ...] = ()
 
     @property
     def rate(self) -> float:
@@ -40,7 +45,7 @@ class Stream(NamedTuple):
         return 1 / float(np.median(np.diff(self.readings.times))) if len(self.readings.times) > 1 else 0.0
 
     def oddities(self) -> list[str]:
-        """Returns texts about oddities: repeats, gaps, bursts, and units that look wrong."""
+        """Returns texts about oddities: repeats, gaps, bursts, outliers, and units that look wrong."""
         times, out = self.readings.times, []
         steps = np.diff(times)
         usual = float(np.median(steps)) if len(steps) else 0.0
@@ -51,7 +56,11 @@ class Stream(NamedTuple):
             out.append(f"{len(gaps)} gaps, the longest {steps[longest]:.3g} s at {times[longest] - times[0]:.4g} s")
         if (share := float((steps < _BURST * usual).mean()) if len(steps) else 0.0) > 0.01:
             out.append(f"bursts: {share:.0%} of the steps are below {_BURST * usual:.2g} s")
+        if far := without_outliers(self.readings)[1]:
+            out.append(f"{far} outliers, fixes that are far from all around them")
         for name, column in zip(self.readings.columns, self.readings.values.T, strict=True):
+            if np.ptp(column) == 0:
+                out.append(f"{name} is always {column[0]:g}")
             size, what = float(np.quantile(np.abs(column), 0.99)), quantity(name)
             if what in ("turn rate", "heading") and size > _TURNS:
                 out.append(f"{name} looks like degrees")
@@ -100,26 +109,36 @@ def _of_file(path: Path, **options) -> dict[str, Stream]:
             except ValueError:  # a topic of images or text
                 continue
         return found
-    whole = Table(path, **options).read()
-    for columns in _together(whole):
-        slow = any(repeats(whole.values[:, whole.columns.index(name)]) for name in columns)
-        table = Table(path, columns, repeats="drop" if slow else "keep", **options)
-        read = table.read()
-        known = [what for what in map(quantity, columns) if what]
-        name = next((named for what, named in _NAMES.items() if what in known), (known or columns)[0])
-        while name in found:
-            name += "_"
-        found[name] = Stream(table, read, 1 - len(read.times) / len(whole.times))
+    full, sparse = sparse_columns(path, options.get("time"))
+    others: list[str] = []
+    groups: list[list[str] | None] = [each for each in (full, *sparse) if each]
+    for group in groups or [None]:
+        whole = Table(path, group, **options).read()
+        others += whole.columns
+        for columns in _together(whole):
+            slow = any(repeats(whole.values[:, whole.columns.index(name)]) for name in columns)
+            table = Table(path, columns, repeats="drop" if slow else "keep", **options)
+            read = table.read()
+            known = [what for what in map(quantity, columns) if what]
+            name = next((named for what, named in _NAMES.items() if what in known), (known or columns)[0])
+            while name in found:
+                name += "_"
+            found[name] = Stream(table, read, 1 - len(read.times) / len(whole.times))
+            others = [each for each in others if each not in columns]
+    for name in list(found)[:1]:
+        found[name] = found[name]._replace(others=tuple(others))
     return found
 
 
 def _together(table: Readings) -> list[list[str]]:
-    """Groups columns that change in the same rows; columns that never change are left out."""
+    """Groups columns that change in the same rows; of those that never change, only one of a place's two is kept."""
     groups: list[tuple[np.ndarray, list[str]]] = []
     fast: list[str] = []
+    still: list[str] = []
     for name, column in zip(table.columns, table.values.T, strict=True):
         changed = np.diff(column) != 0
         if not changed.any():
+            still.append(name)
             continue
         if not repeats(column) and changed.mean() > 0.5:
             fast.append(name)
@@ -131,6 +150,12 @@ def _together(table: Readings) -> list[list[str]]:
                 break
         else:
             groups.append((changed, [name]))
+    for name in still:  # a robot may drive along an axis
+        partner = _PARTNERS.get(quantity(name) or "")
+        for names in (fast, *(names for _, names in groups)):
+            if partner in map(quantity, names):
+                names.append(name)
+                break
     known = [names for _, names in groups if any(map(quantity, names))]
     return [names for names in _by_sensor(fast) if names] + known
 
