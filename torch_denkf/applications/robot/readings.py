@@ -64,9 +64,10 @@ def unread(columns: Sequence[str], places: Collection[int]) -> list[str]:
         >>> unread(["position_m", "yaw_rate", "ax", "ay", "speed"], [6, 11])
         ['position_m', 'ax', 'ay']
     """
-    known = [quantity(name) or name.lower() for name in columns]
-    axes = known.index("acceleration") if "acceleration" in known else len(known)
-    known[axes : axes + 3] = ["acceleration"] * len(known[axes : axes + 3])
+    found = [quantity(name) for name in columns]
+    first = found.index("acceleration") if "acceleration" in found else len(found)
+    others = ["acceleration" if first < at < first + 3 else name.lower() for at, name in enumerate(columns)]  # y and z
+    known = [what or other for what, other in zip(found, others, strict=True)]
     return [name for name, what in zip(columns, known, strict=True) if not set(_TOLD.get(what, ())) & set(places)]
 
 
