@@ -104,6 +104,18 @@ def test_motion_noise_is_drawn_in_bulk_where_its_size_is_known():
     torch.testing.assert_close(every(td)["forecast", "ensemble"], td["belief", "ensemble"] + 1 + td["noise", "self"])
 
 
+@pytest.mark.parametrize("before", [False, True])
+def test_standard_deviations_are_noise_of_those_under_any_keys(before):
+    motion = LearnedTransition(torch.ones_like, in_key=("prior", "x"), out_key=("moved", "x"))
+    noisy = NoisyTransition(motion, [0.5, 0.0], [2, 0], before=before, mean_key=("prior", "mean"), draws="random")
+    td = TensorDict({("prior", "x"): torch.randn(4, E, S), ("noise", "self"): torch.randn(4, E, 2)}, [4])
+    expected = td["prior", "x"] + 1
+    expected[..., 2] += 0.5 * td["noise", "self"][..., 0]
+    torch.testing.assert_close(noisy(td.copy())["moved", "x"], expected)
+    with pytest.raises(ValueError, match="noise is one number, and the number of dimensions is not known"):
+        NoisyTransition(motion, 0.5)
+
+
 @pytest.mark.parametrize("weights", [False, True])
 @pytest.mark.parametrize(("name", "space"), [("belief", None), ("forecast", None), ("belief", Euclidean(S))])
 def test_noise_model_reads_the_weighted_mean(weights, name, space):

@@ -82,7 +82,7 @@ class NoisyTransition(Transition):
         draws: Literal["exact", "random"] = "exact",
     ):
         check_module("transition", transition)
-        noise = as_process_noise(noise, None if dims is None else len(dims), "noise")
+        noise = as_process_noise(noise, None if dims is None else len(dims), "noise", mean_key)
         check_module("noise", noise)
         self_made = {unravel_key(mean_key), unravel_key(forecast_mean_key)}
         needed, optional = reads(transition)

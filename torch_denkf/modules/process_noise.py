@@ -37,6 +37,7 @@ def as_process_noise(
     noise: TensorDictModuleBase | Sequence[float] | torch.Tensor | float,
     size: int | None,
     name: str = "process_noise",
+    in_key: NestedKey = _BELIEF_MEAN,
 ) -> TensorDictModuleBase:
     """Returns a module that writes Q: the given one, or a constant one for standard deviations ``[S]`` or one number.
 
@@ -44,6 +45,7 @@ def as_process_noise(
         noise: the module, or standard deviations in the state's units; 0 for a dimension without noise.
         size: S, if it is known; needed if ``noise`` is one number.
         name: name of the argument, for messages.
+        in_key: entry whose dtype a constant Q takes.
 
     Raises:
         ValueError: if S is not known, or a standard deviation is negative.
@@ -63,9 +65,11 @@ def as_process_noise(
         raise ValueError(f"{name} must be {known}, a standard deviation for each; got {list(std.shape)}")
     if std.ndim == 0:
         if size is None:
-            raise ValueError(f"{name} is one number, and the initial belief does not declare S: give [S].")
+            raise ValueError(
+                f"{name} is one number, and the number of dimensions is not known: give one for each, [S]."
+            )
         std = std.expand(size)
-    return ConstantNoise(std, in_key=_BELIEF_MEAN, out_key=_FORECAST_NOISE)
+    return ConstantNoise(std, in_key=in_key, out_key=_FORECAST_NOISE)
 
 
 class CholeskyNoise(SubModel):

@@ -179,6 +179,19 @@ def test_two_files_of_a_boat(tmp_path):
         log_streams()
 
 
+def test_units_in_names(tmp_path):
+    """A slow turn in degrees, though small, one in rad, though unwrapped, and places in km."""
+    time = np.arange(0, 20, 0.1)
+    turn, place = 0.1 * np.sin(time), np.c_[time, np.sin(time)]
+    head = "t,x [km],y [mm],heading [rad],yaw_rate [deg/s]"
+    table = np.c_[time, place * [1e-3, 1e3], 0.5 * time, np.degrees(turn)]
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=head, comments="")
+    streams = log_streams(tmp_path / "log.csv")
+    seen = read_log("log", read_config(default_settings(streams)), streams).seen
+    np.testing.assert_allclose(seen["imu0_twist"].values[:, 0], turn, atol=1e-9)
+    np.testing.assert_allclose(seen["pose0_pose"].values[:, :3], np.c_[place, 0.5 * time], atol=1e-9)
+
+
 def test_a_pose_alone(tmp_path, capsys):
     """A heading next to x and y is read; a filter of one sensor has its distances without a name."""
     time = np.arange(0, 10, 0.1)

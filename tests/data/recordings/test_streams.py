@@ -28,6 +28,20 @@ def test_blank_cells_are_streams_of_their_own(tmp_path, capsys):
         Table(tmp_path / "log.csv", ["temp", "x"]).read()
 
 
+def test_missing_values_of_parquet_are_blank_cells(tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    time, some = 0.1 * np.arange(40), np.arange(40) % 2 == 0
+    fixes = [value if seen else None for value, seen in zip(np.sin(time).tolist(), some, strict=True)]
+    table = {"t": time, "x": fixes, "y": fixes, "speed": np.cos(time)}
+    parquet.write_table(pyarrow.table(table), tmp_path / "log.parquet")
+    streams = streams_of(tmp_path / "log.parquet")
+    assert {name: stream.readings.columns for name, stream in streams.items()} == {
+        "speed": ("speed",),
+        "position": ("x", "y"),
+    }
+    np.testing.assert_allclose(streams["position"].readings.times, time[some])
+
+
 def test_columns_that_never_change(tmp_path, capsys):
     """One of a place's two is kept, with what it is; others are named."""
     time = np.arange(0, 20, 0.1)

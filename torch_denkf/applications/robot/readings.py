@@ -10,7 +10,8 @@ import numpy as np
 
 from torch_denkf.applications.robot.config import PLANE, Config, SensorConfig
 from torch_denkf.data.earth import to_local
-from torch_denkf.data.recordings.quantities import SPEEDS, find, quantity, speed_unit
+from torch_denkf.data.recordings.outliers import fixes_of
+from torch_denkf.data.recordings.quantities import SPEEDS, find, in_radians, quantity, speed_unit
 from torch_denkf.data.recordings.tables import Readings
 
 __all__ = ["Seen", "from_north", "seen_by", "unread"]
@@ -20,7 +21,6 @@ _TOLD = {
     **dict.fromkeys(("latitude", "longitude", "east", "north", "hdop"), (0, 1)),
     **{"heading": (5,), "speed": (6, 7), "turn rate": (11,), "acceleration": (12, 13, 14)},
 }
-_ROTATING = 7.0  # rad, or rad/s: beyond are degrees
 _XYZ = ("x", "y", "z")
 _SLIP = 0.1  # m/s: standard deviation of a vehicle's speed sideways and upwards, which is read as zero
 _FIRST = 1.0  # m of standard deviation for each unit of hdop, and of what nothing is known
@@ -173,16 +173,16 @@ def _of_names(
     """Fills in columns with usual names."""
     if places := find(table.columns, "latitude", "longitude"):
         values[:, :2] = to_local(table.values[:, places], origin or table.values[0, places].tolist())
-    elif places := find(table.columns, "east", "north"):
-        values[:, :2] = table.values[:, places]
+    elif (fixes := fixes_of(table.columns, table.values)) is not None:
+        values[:, :2] = fixes
     for name, column in columns.items():
-        what, turned = quantity(name), np.abs(column).max(initial=0.0) > _ROTATING
+        what = quantity(name)
         if what == "heading" and (from_north(name) or np.isnan(values[:, 5]).all()):  # a compass before a course
-            angle = np.radians(column) if turned else column
+            angle = in_radians(name, column)
             clockwise = from_north(name) or re.search("course|cog|track", name.lower())
             values[:, 5] = np.pi / 2 - angle if clockwise else angle
         elif what == "turn rate":
-            values[:, 11] = np.radians(column) if turned else column
+            values[:, 11] = in_radians(name, column)
         elif what == "speed" and np.isnan(values[:, 6]).all():
             unit = speed_unit(name, scale)
             values[:, 6], values[:, 7:9] = column / SPEEDS[unit][0] if unit else column, 0.0

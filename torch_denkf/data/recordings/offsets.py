@@ -233,7 +233,7 @@ def _signals(table: Readings) -> dict[str, _Signal]:
         out["way"] = _Signal(times, _integral(times, values[:, speed[0]]), ones)
     if heading := find(columns, "heading"):
         weight = ones if speed is None else np.square(values[:, speed[0]])
-        out["heading"] = _Signal(times, np.unwrap(in_radians(values[:, heading[0]])), weight)
+        out["heading"] = _Signal(times, np.unwrap(in_radians(columns[heading[0]], values[:, heading[0]])), weight)
     if turn := find(columns, "turn rate"):
         out["heading"] = _Signal(times, _integral(times, values[:, turn[0]]), ones)
     return out

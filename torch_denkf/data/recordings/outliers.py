@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torch_denkf.data.earth import to_local
-from torch_denkf.data.recordings.quantities import find
+from torch_denkf.data.recordings.quantities import find, metres
 from torch_denkf.data.recordings.tables import Readings
 
 __all__ = ["fixes_of", "outlying", "without_outliers"]
@@ -23,7 +23,9 @@ def fixes_of(columns: Sequence[str], values: np.ndarray) -> np.ndarray | None:
     """Returns the places ``[n, 2]`` of a table's rows in metres; ``None`` where it has none."""
     if places := find(columns, "latitude", "longitude"):
         return to_local(values[:, places], np.median(values[:, places], 0))
-    return None if (places := find(columns, "east", "north")) is None else values[:, places]
+    if places := find(columns, "east", "north"):
+        return values[:, places] * [metres(columns[place]) for place in places]
+    return None
 
 
 def outlying(times: np.ndarray, fixes: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["SPEEDS", "find", "in_radians", "quantity", "speed_unit"]
+__all__ = ["SPEEDS", "find", "in_radians", "metres", "quantity", "speed_unit"]
 
 #: Units of speed: factor from m/s, and pattern of their names.
 SPEEDS = {"km/h": (3.6, r"km/?h|kph|kmph"), "mph": (2.23694, r"mph"), "knots": (1.94384, r"kn|kts?|knots?")}
@@ -24,7 +24,7 @@ _NAMES = {
     "speed": r".*(speed|velocity|\bsog|\bvx|\bv|(twist[._])?linear[._]x|v_forward)",
     "acceleration": r".*(\bax|acc(el(eration)?)?_?x|linear_acceleration[._]x|a_rs_s_x)",
 }
-_DEGREES = 7.0  # rad: larger headings are in degrees
+_DEGREES = 7.0  # rad, or rad/s: larger ones are in degrees
 
 
 def quantity(name: str) -> str | None:
@@ -57,6 +57,24 @@ def speed_unit(name: str, scale: float = 1.0) -> str | None:
     return "km/h" if 3.1 < scale < 4.2 else None  # other units' scales are too near to 1, as noise reduces them
 
 
-def in_radians(angles: np.ndarray) -> np.ndarray:
-    """Returns headings in rad; values beyond a full turn are taken for degrees."""
+def metres(name: str) -> float:
+    """Returns the metres of a position's unit by its column's name.
+
+    Examples:
+        >>> metres("x [km]"), metres("y (mm)"), metres("north")
+        (1000.0, 0.001, 1.0)
+    """
+    unit = re.search(r"[\[(]\s*(km|cm|mm)\s*[\])]", name.lower())
+    return {"km": 1e3, "cm": 1e-2, "mm": 1e-3}[unit[1]] if unit else 1.0
+
+
+def in_radians(name: str, angles: np.ndarray) -> np.ndarray:
+    """Returns headings or turn rates in rad, by the unit in the column's name; else large values are degrees.
+
+    Examples:
+        >>> in_radians("yaw_rate [deg/s]", np.array([1.0])).round(4), in_radians("yaw_rate", np.array([1.0]))
+        (array([0.0175]), array([1.]))
+    """
+    if unit := re.search(r"(?<![a-z])(deg|degrees?|dps|rad|radians?)(?![a-z])|°", name.lower()):
+        return angles if unit[0].startswith("rad") else np.radians(angles)
     return np.radians(angles) if np.abs(angles).max(initial=0.0) > _DEGREES else angles

@@ -108,6 +108,9 @@ class _Parquet(Source):
             return super().stamps(name)
         return np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) * 1e-9)
 
+    def empty(self, name):
+        return read_parquet(self.file, [name])[name].is_null().to_numpy()
+
     def cell(self, name, row):
         return read_parquet(self.file, [name])[name][row].as_py()
 

@@ -90,6 +90,9 @@ class MemberGain(SubModel):
                 f"MemberGain was made for predictions [*B, {self.quantiles.shape[0]}, {self.quantiles.shape[1]}], "
                 f"ensemble_size by the entries of std; {self.in_keys[0]!r} has shape {list(predicted.shape)}."
             )
+        if steps is not None:
+            check_shape(str(self.optional_keys[0]), steps, (*predicted.shape[:-2], 1), "[*B, 1]")
+            steps = steps.to(predicted.dtype)
         inverse = (-self.log_std.exp() * self.quantiles).exp()
         offset = self.offset_std * self.places
         return predicted * (inverse.mean(-2) / inverse) + (offset if steps is None else steps.unsqueeze(-1) * offset)
