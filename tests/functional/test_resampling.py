@@ -58,6 +58,8 @@ def test_crps_of_rational_weights_is_that_of_repeated_particles(batch):
     log_weights = (counts / 8).log().expand(*batch, 4)
     expected = crps_ensemble(repeated, target, fair=False)
     torch.testing.assert_close(crps_ensemble(particles, target, log_weights), expected)
+    one = crps_ensemble(particles[..., :1, :], target, torch.zeros(*batch, 1))
+    torch.testing.assert_close(one, (particles[..., 0, :] - target).abs())
 
 
 # ------------------------------------------------------------------------------------------------ each scheme

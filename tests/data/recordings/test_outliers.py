@@ -28,6 +28,12 @@ def test_sound_fixes_are_kept():
     assert len(outlying(np.zeros(0), np.zeros((0, 2)))) == 0
 
 
+def test_ends_of_a_window_of_noise_are_kept():
+    """There, the parabola through the other fixes misses a sound one by more."""
+    rng = np.random.default_rng(0)
+    assert not any(outlying(np.arange(11.0), rng.normal(size=(11, 2))).any() for _ in range(100))
+
+
 def test_a_repeated_outlier_is_one():
     """A log at 20 Hz repeats the fixes of 5 Hz: their rows go with them, and count once."""
     _, fixes, wrong, _ = cart(30, 0.1)
@@ -36,7 +42,9 @@ def test_a_repeated_outlier_is_one():
     kept, count = without_outliers(Readings(rows[:, 0], rows[:, 1:], ("x", "y")))
     assert (count, len(kept.times)) == (wrong.sum(), 4 * (~wrong).sum())
     speeds = Readings(rows[:, 0], rows[:, 1:2], ("speed",))
-    assert without_outliers(speeds) == (speeds, 0)
+    late = Readings(rows[:, 0], rows[:, 1:], ("x", "y"), arrived=rows[:, 0] + 1)
+    for table in (speeds, late):
+        assert without_outliers(table) == (table, 0)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -35,6 +35,7 @@ def test_an_offset_lasts_and_comes_once_for_each_step_of_a_pair(float64):
     torch.testing.assert_close(once[..., 0], torch.zeros(3, 32), rtol=0, atol=1e-7)
     assert float(once[0, :, 1].mean()) == pytest.approx(0.0, abs=1e-8)
     assert float(once[0, :, 1].std(correction=0)) == pytest.approx(0.2, rel=1e-6)
+    assert abs(float(torch.corrcoef(torch.stack([gain.quantiles[:, 1], once[0, :, 1]]))[0, 1])) < 0.5  # 0 +- 0.18
     single = TensorDict({"y": samples.float(), "steps": steps.double()}, [3])
     assert gain.float()(single)["y"].dtype == torch.float32
     with pytest.raises(ValueError, match=r"steps must be \[\*B, 1\] = \[3, 1\], got \[3, 32\]"):
