@@ -186,7 +186,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
     # One factor on all noise sets the coverage of the 90 % intervals to 90 %.
     runs = readings.draw(torch.Generator().manual_seed(0), shortest)
 
-    def from_level() -> float:
+    def coverage_error() -> float:
         torch.manual_seed(0)
         with torch.no_grad():
             beliefs = behind.sequence(runs.copy())["belief"]
@@ -194,7 +194,7 @@ def train(denkf: DEnKF, data: LeRobotReplay, held_out: LeRobotReplay, out: Path,
 
     noises = [module for module in denkf.modules() if isinstance(module, ScaledNoise)]
     candidates = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.4, 2.8, 3.3, 4.0)
-    factor = choose(candidates, lambda by: [setattr(noise, "factor", by) for noise in noises], from_level)
+    factor = choose(candidates, lambda by: [setattr(noise, "factor", by) for noise in noises], coverage_error)
     print(f"noise times {factor}, chosen on {len(held_out.episodes)} episodes that the sensor has not seen")
 
 

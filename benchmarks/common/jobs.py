@@ -84,7 +84,7 @@ def read_rows(files: Iterable[Path], shared: Callable[[dict], Hashable] = lambda
         try:
             found = json.loads(file.read_text())
         except ValueError as error:
-            raise ValueError(f"{file} is damaged ({error}); remove it, and the study computes it anew") from error
+            raise ValueError(f"{file} is damaged ({error}); remove it, and the study computes it again") from error
         keyed = [(shared(row), row) for row in found]
         rows += [row for key, row in keyed if key not in seen]
         seen |= {key for key, _ in keyed if key is not None}

@@ -15,6 +15,11 @@ from torch_denkf.training import FilterTrainer, Stage, choose
 from torch_denkf.training.checkpoint import read_checkpoint, write_checkpoint
 
 
+def coverage_error(coverage: Tensor) -> float:
+    """Returns the distance of the coverage of 90 % intervals from 90 %, summed over its components."""
+    return float((coverage - 0.9).abs().sum())
+
+
 def fit_filter(
     recipe: Recipe,
     model: Filter,
@@ -53,7 +58,7 @@ def fit_filter(
     if error is not None:
         inflation = choose(inflations, apply, error)
     elif coverage is not None:
-        inflation = choose(inflations, apply, lambda: float((coverage() - 0.9).abs().sum()))
+        inflation = choose(inflations, apply, lambda: coverage_error(coverage()))
     else:
         raise TypeError("fit_filter chooses the inflation by coverage or by error; pass one of them")
     if trainer.processes.is_main:

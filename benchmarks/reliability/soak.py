@@ -42,7 +42,7 @@ class Soak:
     kills: int = 8  # of each job
     frames: int = 100_000  # of each layout of environments
     seed: int = 0  # of the moments of the kills
-    anew: bool = False  # discard an earlier run's rows of these parts
+    restart: bool = False  # discard an earlier run's rows of these parts
     out: Path = RESULTS / "soak.json"
     smoke: bool = False  # a tiny run
 
@@ -59,7 +59,7 @@ class Soak:
         }
         self.out.parent.mkdir(parents=True, exist_ok=True)
         for part in self.parts:
-            if self.anew:
+            if self.restart:
                 self._keep(part, lambda rows: [])
             for name, job in jobs[part]().items():
                 if any(row["name"] == name for row in self._found().get(part, [])):

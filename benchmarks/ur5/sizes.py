@@ -14,7 +14,7 @@ from benchmarks.common.arm.scores import coverage, filter_error, run_filter
 from benchmarks.common.jobs import once, read_rows
 from benchmarks.common.plots import draw_frontier
 from benchmarks.common.tables import markdown, write_page, write_table
-from benchmarks.common.training import read_filter
+from benchmarks.common.training import coverage_error, read_filter
 from benchmarks.ur5.recipes import UR5Recipe
 from benchmarks.ur5.sensors import MEMBERS
 from benchmarks.ur5.study import Base, Study, members_of, sensor_rows, size_row, trained
@@ -64,8 +64,7 @@ def _inflation(base: Base, recipe: UR5Recipe, saved: dict) -> float:
     """Chooses the inflation of a recipe's update, by the validation demos' coverage."""
     model, readings = read_filter(recipe, recipe.build(), saved), with_missing(recipe, base.codes("validation"))
     apply = partial(recipe.set_inflation, model)
-    off = lambda: float((coverage(run_filter(recipe, model, readings)) - 0.9).abs().sum())  # noqa: E731
-    return choose(INFLATIONS, apply, off)
+    return choose(INFLATIONS, apply, lambda: coverage_error(coverage(run_filter(recipe, model, readings))))
 
 
 def members(study: Study) -> list[Path]:

@@ -261,7 +261,7 @@ def test_the_primer_carries_the_belief_of_a_policy(float64, name):
         assert rollout["belief", "mean"].isfinite().all()
         return
     frames = rollout.select("observation", "observed", "is_init", "action")
-    assert rollout["is_init"].sum() == 4, "each row starts anew once"
+    assert rollout["is_init"].sum() == 4, "each row starts again once"
     assert_equal(filter.sequence(frames), rollout, filter.belief_keys, atol=1e-10)
     resumed = filter.sequence(rollout[:, 2:].exclude("belief"))
     assert_equal(resumed, rollout[:, 2:], filter.belief_keys, atol=1e-10)

@@ -34,7 +34,7 @@ FEATURES = (
     "prefix",
     "stored belief",
 )
-#: Inflation would spread the past anew with each reading.
+#: Inflation would spread the past again with each reading.
 APART = {("late reading", "inflation"), ("joint past", "inflation")}
 PAIRS = [pair for pair in combinations(FEATURES, 2) if pair not in APART]
 EAGER = ("loop", "sequence", "transform", "policy")

@@ -104,12 +104,12 @@ def test_flat_slices_are_the_slices():
 # ------------------------------------------------------------------------------------------------------ of a policy
 
 
-def policy_data(filter, *, anew=()):
+def policy_data(filter, *, again=()):
     """Returns a policy's data ``[2, 7]``: the belief before each step; and what each step gives."""
     frames, rows, steps = readings(2, 7), [], []
     belief = filter.step(filter.initialise(frames[:, 0].copy()).update(frames[:, 0]))
     for t in range(7):
-        row = frames[:, t].copy().set(("previous", "known"), torch.full((2, 1), t not in anew))
+        row = frames[:, t].copy().set(("previous", "known"), torch.full((2, 1), t not in again))
         for key in filter.carry_keys:
             row["previous", *key] = belief[key]
         belief = filter(row.copy())
@@ -119,19 +119,19 @@ def policy_data(filter, *, anew=()):
 
 
 @every_filter
-@pytest.mark.parametrize("anew", [(), (3,), (0, 5)])
-def test_every_element_is_a_step_diagnostics_and_all(name, anew):
+@pytest.mark.parametrize("again", [(), (3,), (0, 5)])
+def test_every_element_is_a_step_diagnostics_and_all(name, again):
     """Without a belief before it, an element is reset: not from what the policy stored for its actor."""
     filter = FILTERS[name]()
-    data, steps = policy_data(filter, anew=anew)
+    data, steps = policy_data(filter, again=again)
     close(filter.sequence(data.copy()), steps, filter.out_keys)
-    known = torch.tensor([t not in anew for t in range(7)])
+    known = torch.tensor([t not in again for t in range(7)])
     assert (steps["info", "nis"] != 0).all(0).flatten().equal(known)
     assert filter.stepped(data).equal(known.expand(2, 7))
     for key in filter.carry_keys:
         data[key] = 3.0 * steps[key]
     close(filter.sequence(data.copy()), steps, filter.belief_keys)
-    for t in anew:
+    for t in again:
         close(steps[:, t], filter.initialise(TensorDict({}, [2])), filter.belief_keys)
     data = data.exclude(*filter.carry_keys)
     data["is_init"] = torch.zeros(2, 7, 1, dtype=torch.bool)  # marks that say nothing hide no missing belief
@@ -172,7 +172,7 @@ def test_the_action_before_drives_the_step_and_need_not_be_stored_twice():
 def test_nan_in_an_unused_reading_of_a_reset_is_allowed(name, update_at_reset):
     """NaN raises only in rows that are not reset, or if the first frame is used."""
     filter = FILTERS[name]().with_options(update_at_reset=update_at_reset)
-    row = policy_data(filter, anew=(0,))[0][:, 0]
+    row = policy_data(filter, again=(0,))[0][:, 0]
     row["previous", "known"][1] = True
     first, second = row.clone(), row.clone()
     first["observation"][0], second["observation"][1] = torch.nan, torch.nan

@@ -177,7 +177,7 @@ def test_action_latency_with_partial_resets():
     env = LinearGaussianEnv(F, H, [0.0] * 2, [0.0] * 2, control=torch.tensor(B_), batch_size=[3], max_steps=[4, 9, 9])
     data = TransformedEnv(env, LateActions(K)).rollout(9, break_when_any_done=False)
     ran = torch.cat([torch.zeros(3, K, 1), data["action"][:, :-K]], 1)
-    ran[0, 4 : 4 + K] = ran[0, 8] = 0  # begins anew, without the actions of before
+    ran[0, 4 : 4 + K] = ran[0, 8] = 0  # begins again, without the actions of before
     assert data[NEXT][:, :, 0].equal(ran)
     expected = data["state"] @ F.mT + ran @ torch.tensor(B_).mT
     torch.testing.assert_close(data["next", "state"], expected)
@@ -209,8 +209,8 @@ def test_log_ratio_is_zero_for_a_policy_on_the_prediction(make):
         env = TransformedEnv(env, get_env_transforms_from_module(policy))
         data = env.rollout(12, policy, break_when_any_done=False)
     assert log_ratio(policy, data.reshape(-1, 4)).abs().max() < 1e-9
-    anew = data.exclude(("ahead", "drawn"))
-    assert log_ratio(policy, anew.reshape(-1, 4)).std() > 1e-3
+    again = data.exclude(("ahead", "drawn"))
+    assert log_ratio(policy, again.reshape(-1, 4)).std() > 1e-3
 
 
 @pytest.mark.parametrize(

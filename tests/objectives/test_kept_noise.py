@@ -122,10 +122,10 @@ def test_the_log_ratio_before_an_update_is_zero(float64, name):
 def test_without_keep_noise_new_noise_is_drawn(float64, name):
     policy = make_policy(FILTERS[name]())
     data = rollout(policy)
-    anew = make_policy(policy[0].with_options(keep_noise=False))
-    anew.load_state_dict(policy.state_dict())
-    assert log_ratio(anew, data).std() > 1e-3
-    assert policy[0].outer("drawn") not in rollout(anew).keys(True)
+    again = make_policy(policy[0].with_options(keep_noise=False))
+    again.load_state_dict(policy.state_dict())
+    assert log_ratio(again, data).std() > 1e-3
+    assert policy[0].outer("drawn") not in rollout(again).keys(True)
 
 
 def test_clipping_and_a2c_see_no_change(float64):

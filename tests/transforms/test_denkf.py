@@ -70,7 +70,7 @@ def test_partial_resets(env):
     for start in (ensemble[:, 0], ensemble[:, 1:][after]):
         assert (start[..., 0] == known).all(), "rows that reset get the prior"
         assert ((start[..., 1] - drawn).abs() < 5).all()
-        assert start[..., 1].unique().numel() == start[..., 1].numel(), "drawn anew each time"
+        assert start[..., 1].unique().numel() == start[..., 1].numel(), "drawn again each time"
     assert ensemble[:, 1:][~after].equal(next_ensemble[:, :-1][~after]), "other rows keep their belief"
     # It is not the prior that they keep: two steps on, every member has moved.
     assert (next_ensemble[..., 0] != known).all()

@@ -26,7 +26,7 @@ def test_a_rollout_is_the_recording_smoothed(float64, name):
     """Rows reset at different times; what an environment says later is what the smoother says of the time before."""
     env = lagged_env(name, batch_size=[2], max_steps=[3, 7], seed=0)
     rollout = envs.random_rollout(env, 12)
-    assert rollout["is_init"].sum() == 6, "both rows start anew inside"
+    assert rollout["is_init"].sum() == 6, "both rows start again inside"
     online = FixedLag(FILTERS[name](), LAG)
     frames = rollout.select("observation", "observed", "is_init")
     assert_equal(rollout, online.sequence(frames.copy()), [*KEYS, ("belief", "mean")], atol=1e-9)

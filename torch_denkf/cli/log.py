@@ -53,7 +53,7 @@ class Log(Command):
             for text in one.oddities():
                 say(f"  {text}")
         if others := [name for one in streams.values() for name in one.others]:
-            say(f"in no stream, since they never change, or not with a sensor's: {', '.join(others)}")
+            say(f"not used, as they are constant or change at other times than the sensors: {', '.join(others)}")
         tables = {name: one.readings for name, one in streams.items()}
         delays = delays_between(tables)
         offsets = solved(delays, tables) if delays else {}

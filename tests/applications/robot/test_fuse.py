@@ -240,10 +240,13 @@ def test_columns_that_are_not_used(tmp_path, capsys):
     report, out = (tmp_path / "out/report.md").read_text(), capsys.readouterr().out
     for text in (report, out):
         assert "ot used: position_m" in text
-        assert "o fixes: the path has no place to begin at, and drifts; columns of places are latitude and" in text
+        assert (
+            "o position fixes: the path starts at the origin and drifts; names of position columns are latitude and"
+            in text
+        )
     np.savetxt(tmp_path / "log.csv", table[:, :2], delimiter=",", header="t,position_m", comments="")
     assert main(["fuse", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]) == 2
-    assert "none of the columns ['position_m'] is known: name them latitude" in capsys.readouterr().err
+    assert "none of the columns ['position_m'] is known; names are latitude" in capsys.readouterr().err
 
 
 def test_a_cart_on_an_axis(tmp_path, capsys):

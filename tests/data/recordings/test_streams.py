@@ -52,4 +52,4 @@ def test_columns_that_never_change(tmp_path, capsys):
     assert main(["log", str(tmp_path / "log.csv")]) == 0
     out = capsys.readouterr().out
     assert "y [m] is always 0" in out
-    assert "in no stream, since they never change, or not with a sensor's: heading" in out
+    assert "not used, as they are constant or change at other times than the sensors: heading" in out

@@ -79,14 +79,14 @@ def default_settings(streams: Mapping[str, Stream]) -> dict:
                 read = (*places, 5) if kind == "pose" and turned else places
                 settings[f"{kind}{number}_config"] = [place in read for place in range(15)]
                 number += 1
-    if len(settings) == 3:
+    if not any(name.endswith("_config") for name in settings):
         every = [name for stream in streams.values() for name in (*stream.readings.columns, *stream.others)]
-        raise ValueError(f"none of the columns {every} is known: name them {_PLACES}, speed, heading or yaw_rate")
+        raise ValueError(f"none of the columns {every} is known; names are {_PLACES}, speed, heading or yaw_rate")
     return settings
 
 
 def not_used(streams: Mapping[str, Stream], config: Config) -> list[str]:
-    """Says what of a log the settings do not read: topics, columns, and places if there is none."""
+    """Returns texts on the topics and columns that the settings do not read, and on missing position fixes."""
     read: dict[str, list[int]] = {}
     for sensor in config.sensors:
         read.setdefault(sensor.topic.strip("/"), []).extend(place for each in sensor.groups.values() for place in each)
@@ -99,7 +99,9 @@ def not_used(streams: Mapping[str, Stream], config: Config) -> list[str]:
             unused.append(name)
     out = [f"not used: {', '.join(unused)}"] if unused else []
     if not any({0, 1} & set(places) for places in read.values()):
-        out.append(f"no fixes: the path has no place to begin at, and drifts; columns of places are {_PLACES}")
+        out.append(
+            f"no position fixes: the path starts at the origin and drifts; names of position columns are {_PLACES}"
+        )
     return out
 
 

@@ -201,12 +201,12 @@ def _train_filter(
     stage = Stage("filter", loss, sample, updates, lr=4e-3, validate=error)
     FilterTrainer(behind, [stage], out=out, validate_every=max(updates // 6, 1), **trainer).fit()
 
-    def from_level() -> float:
+    def coverage_error() -> float:
         out = _believe(behind, held_out)
         parts = (out["belief", "mean"], out["belief", "var"], out["state"])
         return abs(float(interval_coverage(*(part.flatten(0, 1) for part in parts), level=0.9).mean()) - 0.9)
 
-    choose(_INFLATIONS, lambda factor: setattr(model, "inflation", factor), from_level)
+    choose(_INFLATIONS, lambda factor: setattr(model, "inflation", factor), coverage_error)
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ import numpy as np
 from torch_denkf.data.recordings.outliers import fixes_of, outlying
 from torch_denkf.data.recordings.quantities import find, in_radians, quantity
 from torch_denkf.data.recordings.replay import Recording
-from torch_denkf.data.recordings.tables import Readings, Table
+from torch_denkf.data.recordings.tables import Readings, Table, changes
 from torch_denkf.diagnosis.logs import repeats
 
 __all__ = ["ClockOffset", "Delay", "changes_of", "clock_offsets", "delays_between", "solved"]
@@ -221,7 +221,7 @@ def _signals(table: Readings) -> dict[str, _Signal]:
     columns, times, values = table.columns, table.times, table.values
     known = [place for place, name in enumerate(columns) if quantity(name)]
     if any(repeats(values[:, place]) for place in known):
-        new = np.append(True, (np.diff(values[:, known], axis=0) != 0).any(1))
+        new = changes(values[:, known])
         times, values = times[new], values[new]
     ones, out = np.ones(len(times)), {}
     speed = find(columns, "speed")

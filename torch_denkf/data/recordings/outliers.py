@@ -8,7 +8,7 @@ import numpy as np
 
 from torch_denkf.data.earth import to_local
 from torch_denkf.data.recordings.quantities import find, metres
-from torch_denkf.data.recordings.tables import Readings
+from torch_denkf.data.recordings.tables import Readings, changes
 
 __all__ = ["fixes_of", "outlying", "without_outliers"]
 
@@ -40,7 +40,7 @@ def outlying(times: np.ndarray, fixes: np.ndarray) -> np.ndarray:
         times: s, ``[n]``.
         fixes: m, ``[n, 2]``; a row that repeats the one before it is judged as that one.
     """
-    new = np.append(True, (np.diff(fixes, axis=0) != 0).any(1))[: len(fixes)]
+    new = changes(fixes)
     kept = np.flatnonzero(new)
     for _ in range(_ROUNDS):  # outliers that stand close hide each other
         far = _far(times[kept], fixes[kept])
@@ -86,5 +86,4 @@ def without_outliers(table: Readings) -> tuple[Readings, int]:
     if fixes is None or table.arrived is not None:
         return table, 0
     far = outlying(table.times, fixes)
-    new = np.append(True, (np.diff(fixes, axis=0) != 0).any(1))
-    return table._replace(times=table.times[~far], values=table.values[~far]), int((far & new).sum())
+    return table._replace(times=table.times[~far], values=table.values[~far]), int((far & changes(fixes)).sum())

@@ -16,7 +16,7 @@ from torch_denkf.data.recordings.stamps import unit_of
 from torch_denkf.data.times import Way
 from torch_denkf.diagnosis.logs import SECONDS, Unit, in_origin, look_at_numbers, look_at_times
 
-__all__ = ["Readings", "Table", "Unit", "check_times", "given_times"]
+__all__ = ["Readings", "Table", "Unit", "changes", "check_times", "given_times"]
 
 
 class Readings(NamedTuple):
@@ -171,8 +171,18 @@ class Table:
         look_at_numbers(values, names, self.file)
         if self.repeats != "drop":
             return Readings(times, values, names, arrived)
-        new, until = np.append(True, (np.diff(values, axis=0) != 0).any(1)), times if arrived is None else arrived
+        new, until = changes(values), times if arrived is None else arrived
         return Readings(times[new], values[new], names, None if arrived is None else arrived[new], float(until.max()))
+
+
+def changes(values: np.ndarray) -> np.ndarray:
+    """Marks the rows ``[N]`` of readings ``[N, D]`` that differ from the row before; the first one does.
+
+    Examples:
+        >>> changes(np.array([[1.0], [1.0], [2.0]])).tolist(), changes(np.zeros((0, 2))).tolist()
+        ([True, False, True], [])
+    """
+    return np.append(True, (np.diff(values, axis=0) != 0).any(1))[: len(values)]
 
 
 def check_stream(sample: str, ways: Sequence[str], tolerance: float | None, unit: str | None) -> None:

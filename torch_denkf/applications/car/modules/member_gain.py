@@ -81,7 +81,7 @@ class MemberGain(SubModel):
         check_shape("offset_std", offset_std, tuple(std.shape), "[O]")
         self.register_buffer("offset_std", offset_std)
         orders = [torch.randperm(ensemble_size, generator=generator) for _ in std]
-        self.register_buffer("places", torch.stack([quantiles[order] for order in orders], -1))
+        self.register_buffer("offset_quantiles", torch.stack([quantiles[order] for order in orders], -1))
 
     def compute(self, predicted, steps=None):
         """Returns the predictions with each member's gain and offset."""
@@ -94,5 +94,5 @@ class MemberGain(SubModel):
             check_shape(str(self.optional_keys[0]), steps, (*predicted.shape[:-2], 1), "[*B, 1]")
             steps = steps.to(predicted.dtype)
         inverse = (-self.log_std.exp() * self.quantiles).exp()
-        offset = self.offset_std * self.places
+        offset = self.offset_std * self.offset_quantiles
         return predicted * (inverse.mean(-2) / inverse) + (offset if steps is None else steps.unsqueeze(-1) * offset)
