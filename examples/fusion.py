@@ -94,7 +94,7 @@ def main() -> None:
 
     print("\nWheel and GPS, whose readings have a latency of 0.3 s:")
     print(f"  latency ignored      {error(run(make(delay=0), data, 'laser')):.3f}")
-    print(f"  latency modelled      {error(run(fused, data, 'laser')):.3f}")
+    print(f"  latency modelled     {error(run(fused, data, 'laser')):.3f}")
 
     # Steps of irregular length: the motion and its noise follow from the seconds since the last step.
     motion = ContinuousMotion(RATE)
